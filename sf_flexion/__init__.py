@@ -1,3 +1,3 @@
-"""The flexion block."""
+"""Flexion: an image made of depth alone, for tracking and colouring where no camera image exists."""
 
 # SPDX-License-Identifier: Apache-2.0
