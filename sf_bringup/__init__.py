@@ -1,0 +1,3 @@
+"""Plans, starts, replays, records and evaluates production lines; the sf command."""
+
+# SPDX-License-Identifier: Apache-2.0

@@ -1,0 +1,3 @@
+"""Completes the depth: multi-view estimation and completion of sparse depth, with variance."""
+
+# SPDX-License-Identifier: Apache-2.0

@@ -1,0 +1,3 @@
+"""Completes the image: flexion images from depth, for sensors without colour."""
+
+# SPDX-License-Identifier: Apache-2.0
