@@ -1,4 +1,4 @@
-"""Makes Python code of this checkout win over the installed copy; generated and compiled modules stay installed."""
+"""Lets Python code of this checkout win over the installed copy; what is compiled stays installed."""
 
 # SPDX-License-Identifier: Apache-2.0
 import sysconfig

@@ -39,7 +39,7 @@ def imports(path: Path) -> Iterator[tuple[int, str]]:
 def is_ros(name: str) -> bool:
     """Whether an import brings rclpy or a message package, generated ones of ours included."""
     parts = name.split(".")
-    generated = parts[0].endswith("_msgs") or parts[0].endswith("_interfaces") and parts[0] != "sf_interfaces"
+    generated = parts[0] != "sf_interfaces" and parts[0].endswith(("_msgs", "_interfaces"))
     return parts[0] in ROS or generated or parts[:2] in (["sf_interfaces", "msg"], ["sf_interfaces", "srv"])
 
 
