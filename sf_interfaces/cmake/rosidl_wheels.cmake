@@ -18,9 +18,10 @@ function(sf_drop_missing_include_directories)
   endforeach()
 endfunction()
 
-# Inside the wheel only Python speaks the messages: leaving out what only C++ nodes use halves the build time.
+# Inside the wheel only Python speaks the messages, so the build leaves out what only C++ nodes use. The
+# introspection of C stays: Fast DDS describes the types with it, and refuses a publisher without it.
 macro(sf_python_type_supports_only)
   if(DEFINED SKBUILD)
-    list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "introspection")
+    list(FILTER AMENT_EXTENSIONS_rosidl_generate_idl_interfaces EXCLUDE REGEX "introspection_cpp")
   endif()
 endmacro()
