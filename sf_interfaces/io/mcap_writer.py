@@ -111,6 +111,10 @@ class McapWriter:
         """The channels so far, in the order of their first message."""
         return tuple(self._channels.values())
 
+    def type_of(self, topic: str) -> str:
+        """The type of a topic that has been written."""
+        return next(kind for name, kind in self._channels if name == topic)
+
     def _reset_chunk(self) -> None:
         self._pieces: list[bytes] = []
         self._size = 0

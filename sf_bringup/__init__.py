@@ -1,0 +1,3 @@
+"""What starts things: command line, planner, player, recorder, demos."""
+
+# SPDX-License-Identifier: Apache-2.0
