@@ -47,7 +47,7 @@ class RowAdam:
         per_row = (near.weights[:, :, None] * gradient[:, None, :]).reshape(-1, gradient.shape[1])
         self._gradient.index_add_(0, ids, per_row)
         touched = torch.zeros(len(self.steps), dtype=torch.bool)
-        touched[ids.long()] = True
+        touched[ids[near.weights.reshape(-1) > 0].long()] = True  # not row 0, which stands for no neighbour
         rows = touched.nonzero()[:, 0]
         g = self._gradient[rows]
         self._gradient[rows] = 0.0
@@ -88,6 +88,7 @@ class Trainer:
         self.network_rate = network_rate
         self.views: list[TrainingView] = []
         self.iteration = 0
+        self.losses: list[float] = []
         self._rows = [RowAdam(f.shape[1]) for f in field.features]
         self._network = torch.optim.Adam(field.network.parameters(), lr=network_rate, betas=BETAS, eps=EPSILON)
 
@@ -97,10 +98,12 @@ class Trainer:
             self.views.append(view)
 
     def run(self, iterations: int) -> list[float]:
-        """Train; returns the loss of every iteration (mean squared error of RGB in 0..1)."""
+        """Train; returns the loss of these iterations (mean squared error of RGB in 0..1)."""
         for adam, features in zip(self._rows, self.field.features, strict=True):
             adam.grow(len(features))
-        return [self._iterate() for _ in range(iterations if self.views else 0)]
+        new = [self._iterate() for _ in range(iterations if self.views else 0)]
+        self.losses += new
+        return new
 
     def _iterate(self) -> float:
         view = min(self.views, key=lambda v: v.turns)  # least trained first; ties: the oldest
