@@ -110,7 +110,8 @@ class Trainer:
         view.turns += 1
         factor = JUMP_FACTOR if self.iteration < self.jump_iterations else 1.0
         self.iteration += 1
-        pick = self._rng.integers(0, len(view.points), self.pixels)
+        # Sorted: neighbouring pixels ask for the same grid cells one after another.
+        pick = np.sort(self._rng.integers(0, len(view.points), self.pixels))
         near = self.field.neighbourhoods(view.points[pick])
         encoded = self.field.encode(near).requires_grad_(True)
         error = self.field.decode(encoded, near) - torch.from_numpy(view.colors[pick])
