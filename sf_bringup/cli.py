@@ -1,0 +1,262 @@
+"""The command line: one verb per task, one sentence per error (exit code 2), a traceback only for bugs (1)."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import argparse
+import importlib
+import json
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from sf_interfaces.errors import ConfigError, SceneFactoryError
+
+# Verbs that are programs of their own: their arguments go to that module's main untouched.
+PASSED_ON = {
+    "up": ("sf_bringup.orchestrator", "orchestrate a line on live topics"),
+    "play": ("sf_bringup.player", "publish a bag, live or lossless"),
+    "record": ("sf_bringup.recorder", "record topics to mcap"),
+}
+GOALS = ("auto", "tracking", "slam", "recon", "mvd", "completion")
+
+
+def _overrides(pairs: Sequence[str]) -> dict[str, str]:
+    out = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {pair}: write it as section.key=value")
+        out[key] = value
+    return out
+
+
+def _print(value: Any, as_json: bool, text: str) -> None:
+    print(json.dumps(value, default=str) if as_json else text)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from sf_bringup.runner import RunRequest, run
+
+    request = RunRequest(
+        inputs=tuple(args.input),
+        goal=args.goal,
+        engine=args.engine,
+        out=args.out,
+        calibration=args.calibration,
+        poses=args.poses,
+        extrinsic=args.extrinsic,
+        config=args.config,
+        overrides=_overrides(args.set),
+        mapping=_overrides(args.map),
+        rate=args.rate,
+    )
+    summary = run(request)
+    _print(summary.values, args.json, summary.text())
+    return 0
+
+
+def _plan(args: argparse.Namespace) -> int:
+    from sf_bringup.runner import explain
+
+    value, text = explain(tuple(args.input), args.goal, args.calibration, args.poses, _overrides(args.map))
+    _print(value, args.json, text)
+    return 0
+
+
+def _convert(args: argparse.Namespace) -> int:
+    from sf_bringup.inputs import convert
+
+    summary = convert(args.dataset, args.out)
+    _print({"out": str(args.out), "topics": summary}, args.json, f"wrote {args.out}: {summary}")
+    return 0
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    from sf_bringup.simulate.command import simulate_command
+
+    return simulate_command(args)
+
+
+def _blocks(args: argparse.Namespace) -> int:
+    from sf_interfaces.blocks import load_blocks
+
+    specs = load_blocks()
+    value = [
+        {
+            "id": s.id,
+            "provides": sorted(q.value for q in s.provides),
+            "requires": sorted(q.value for q in s.requires),
+            "optional": sorted(q.value for q in s.optional),
+            "runs": s.executable,
+        }
+        for s in specs
+    ]
+    lines = [
+        f"{v['id']:16} {', '.join(v['requires'])} -> {', '.join(v['provides'])}"
+        + ("" if v["runs"] else "   (planned only: this version does not run it)")
+        for v in value
+    ]
+    _print(value, args.json, "\n".join(lines))
+    return 0
+
+
+def _doctor(args: argparse.Namespace) -> int:
+    from sf_bringup.doctor import checks
+
+    rows = checks()
+    value = [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in rows]
+    _print(value, args.json, "\n".join(f"{'ok  ' if c.ok else 'FAIL'} {c.name}: {c.detail}" for c in rows))
+    return 0 if all(c.ok for c in rows) else 2
+
+
+def _demo(args: argparse.Namespace) -> int:
+    from sf_bringup.demo import demo
+
+    summary = demo(args.out, args.engine)
+    _print(summary.values, args.json, summary.text())
+    return 0
+
+
+def _render(args: argparse.Namespace) -> int:
+    from sf_bringup.products import render_views
+
+    count = render_views(args.run, args.poses, args.out)
+    _print({"views": count}, args.json, f"wrote {count} views to {args.out}")
+    return 0
+
+
+def _view(args: argparse.Namespace) -> int:
+    from sf_bringup.products import view
+
+    view(args.run)
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    from sf_bringup.products import export
+
+    written = export(args.run, args.out, tum=args.tum, kitti=args.kitti, ply=args.ply)
+    _print([str(p) for p in written], args.json, "\n".join(f"wrote {p}" for p in written))
+    return 0
+
+
+def _eval(args: argparse.Namespace) -> int:
+    from sf_bringup.measures import MEASURES
+
+    value = MEASURES[args.measure](args)
+    _print(value, args.json, "\n".join(f"{key:18} {number}" for key, number in value.items()))
+    return 0
+
+
+def _report(args: argparse.Namespace) -> int:
+    from sf_bringup.summary import summarise, write_page
+
+    summary = summarise(args.run)
+    write_page(summary)
+    _print(summary.values, args.json, summary.text())
+    return 0
+
+
+def _add_input(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "input", nargs="+", type=Path, help="bag (.mcap, .db3, .bag, rosbag2 folder) or data set folder"
+    )
+    parser.add_argument("--goal", choices=GOALS, default="auto")
+    parser.add_argument("--calibration", type=Path, help="camera.yaml in ROS camera_info format")
+    parser.add_argument("--poses", type=Path, help="given poses, TUM format, T_map_camera")
+    parser.add_argument(
+        "--map",
+        action="append",
+        default=[],
+        metavar="ROLE=TOPIC",
+        help="take this topic as rgb, depth, lidar or pose",
+    )
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser alone, without importing any block: help and completion stay fast."""
+    parser = argparse.ArgumentParser(
+        prog="sf", description="SceneFactory: production lines for scene modelling on ROS 2"
+    )
+    verbs = parser.add_subparsers(dest="verb", required=True)
+
+    def verb(name: str, action: Callable[[argparse.Namespace], int], help: str) -> argparse.ArgumentParser:
+        sub = verbs.add_parser(name, help=help, description=help)
+        sub.add_argument("--json", action="store_true", help="print one JSON object")
+        sub.set_defaults(action=action)
+        return sub
+
+    p = verb("run", _run, "run the line that the input needs, from file to results")
+    _add_input(p)
+    p.add_argument("--engine", choices=("inproc", "ros"), default="inproc")
+    p.add_argument("--out", type=Path, default=Path("out"))
+    p.add_argument(
+        "--extrinsic", type=Path, help="T_camera_lidar as a 4x4 text file, if the input has no /tf_static"
+    )
+    p.add_argument("--config", type=Path)
+    p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
+    p.add_argument(
+        "--rate", type=float, default=0.0, help="play live at this rate (ros engine); 0 = lossless"
+    )
+
+    _add_input(verb("plan", _plan, "print the line and why, without computing"))
+    for name, (_, help) in PASSED_ON.items():
+        verbs.add_parser(name, help=help, add_help=False)
+
+    p = verb("convert", _convert, "write a data set as an mcap bag")
+    p.add_argument("dataset", type=Path)
+    p.add_argument("out", type=Path)
+
+    p = verb("simulate", _simulate, "write a bag with exact ground truth from a procedural scene")
+    from sf_bringup.simulate.command import add_arguments
+
+    add_arguments(p)
+
+    verb("blocks", _blocks, "list the installed blocks")
+    verb("doctor", _doctor, "check the installation and the machine")
+    p = verb("demo", _demo, "simulate, play, record, measure: the whole system in one command")
+    p.add_argument("--out", type=Path, default=Path("demo"))
+    p.add_argument("--engine", choices=("inproc", "ros"), default="ros")
+
+    p = verb("render", _render, "render views of a finished run")
+    p.add_argument("run", type=Path)
+    p.add_argument("--poses", type=Path, required=True, help="T_map_camera in TUM format")
+    p.add_argument("--out", type=Path, required=True)
+    verb("view", _view, "show the surface of a finished run").add_argument("run", type=Path)
+
+    p = verb("export", _export, "write the results of a run in other formats")
+    p.add_argument("run", type=Path)
+    p.add_argument("--out", type=Path, required=True)
+    for form in ("tum", "kitti", "ply"):
+        p.add_argument(f"--{form}", action="store_true")
+
+    p = verb("eval", _eval, "measure a run against its reference")
+    p.add_argument("measure", choices=("traj", "depth", "completion", "render"))
+    p.add_argument("run", type=Path)
+    p.add_argument("--reference", type=Path, help="TUM trajectory (default: /ground_truth/pose of the input)")
+    p.add_argument(
+        "--holdout", type=float, default=0.5, help="fraction of LiDAR points to predict (completion)"
+    )
+    verb("report", _report, "write report.html and the picture of a run").add_argument("run", type=Path)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb. Returns 0 done, 2 bad input (one sentence on stderr); a bug raises (exit code 1)."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    try:
+        if argv and argv[0] in PASSED_ON:
+            return int(importlib.import_module(PASSED_ON[argv[0]][0]).main(argv[1:]) or 0)
+        args = build_parser().parse_args(argv)
+        return int(args.action(args))
+    except SceneFactoryError as error:
+        print(f"sf: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

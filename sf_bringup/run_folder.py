@@ -1,0 +1,124 @@
+"""The folder a run leaves behind: what lies where, and how to read it back (ARCHITECTURE of outputs in docs)."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from sf_interfaces import topics
+from sf_interfaces.errors import FormatError
+from sf_interfaces.io.bag import BagReader
+from sf_interfaces.io.trajectory import read_tum
+from sf_interfaces.ros.messages import decode_camera_info, decode_depth, to_ns
+from sf_interfaces.types import Camera, DepthMap, Trajectory
+
+
+@dataclass(frozen=True, slots=True)
+class RunFolder:
+    """Paths and readers of one run."""
+
+    path: Path
+
+    @staticmethod
+    def open(path: Path) -> RunFolder:
+        """An existing run.
+
+        Raises:
+            FormatError: the folder holds no ``run.json``.
+        """
+        if not (path / "run.json").is_file():
+            raise FormatError(
+                f"{path} is not the output of a run (no run.json); give the --out folder of 'sf run'"
+            )
+        return RunFolder(path)
+
+    @property
+    def result(self) -> Path:
+        """The recorded messages."""
+        return self.path / "result.mcap"
+
+    @property
+    def map(self) -> Path:
+        """The neural points and colour field."""
+        return self.path / "map.sfmap"
+
+    def info(self) -> dict[str, Any]:
+        """What was run: input, goal, engine, plan, topics, times."""
+        loaded: dict[str, Any] = json.loads((self.path / "run.json").read_text())
+        return loaded
+
+    def trajectory(self) -> Trajectory:
+        """Final pose of every frame, T_map_camera.
+
+        Raises:
+            FormatError: the line of this run had no tracker.
+        """
+        path = self.path / "trajectory.tum"
+        if not path.is_file():
+            raise FormatError(f"{path} is missing: this run estimated no poses")
+        return read_tum(path)
+
+    def keyframes(self) -> Trajectory:
+        """Final pose of every keyframe, T_map_camera."""
+        return read_tum(self.path / "keyframes.tum")
+
+    def depth_maps(self) -> Iterator[tuple[int, DepthMap]]:
+        """Depth with variance of each keyframe, by stamp."""
+        for path in sorted((self.path / "depth").glob("*.npz")):
+            with np.load(path) as data:
+                yield int(path.stem), DepthMap(data["z"], data["variance"] if "variance" in data else None)
+
+    def camera(self) -> Camera:
+        """The camera of the run."""
+        values = yaml.safe_load((self.path / "camera.yaml").read_text())
+        k = values["camera_matrix"]["data"]
+        width, height = values["image_width"], values["image_height"]
+        return Camera(width, height, k[0], k[4], k[2] + 0.5, k[5] + 0.5, values["camera_name"])
+
+
+def write_camera(path: Path, camera: Camera) -> None:
+    """Write intrinsics in the layout of ROS camera_calibration (pixel centres at integers there)."""
+    k = [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0]
+    document = {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": camera.frame_id,
+        "camera_matrix": {"rows": 3, "cols": 3, "data": k},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]},
+    }
+    path.write_text(yaml.safe_dump(document, sort_keys=False))
+
+
+def unpack(run: RunFolder) -> None:
+    """Write ``depth/<stamp>.npz`` (z, variance) and ``camera.yaml`` from the recorded messages."""
+    depth_topic, variance_topic = topics.DENSE_IMAGE.name, topics.DENSE_VARIANCE.name
+    wanted = [depth_topic, variance_topic, topics.KEYFRAME_DEPTH.name, topics.KEYFRAME_INFO.name]
+    maps: dict[str, dict[int, np.ndarray]] = {name: {} for name in wanted[:3]}
+    camera: Camera | None = None
+    with BagReader(run.result) as reader:
+        wanted = [name for name in [*wanted, topics.DENSE_INFO.name] if name in reader.topics]
+        for raw in reader.messages(wanted):
+            message = reader.decode(raw)
+            if raw.topic in maps:
+                maps[raw.topic][to_ns(message.header.stamp)] = decode_depth(message).z
+            elif camera is None:
+                camera, _ = decode_camera_info(message)
+    if camera is not None:
+        write_camera(run.path / "camera.yaml", camera)
+    folder = run.path / "depth"
+    folder.mkdir(exist_ok=True)
+    for stamp, z in (maps[depth_topic] or maps[topics.KEYFRAME_DEPTH.name]).items():
+        arrays = {"z": z}
+        if stamp in maps[variance_topic]:
+            arrays["variance"] = maps[variance_topic][stamp]
+        np.savez_compressed(folder / f"{stamp:020d}.npz", **arrays)

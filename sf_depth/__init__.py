@@ -1,0 +1,3 @@
+"""The depth block."""
+
+# SPDX-License-Identifier: Apache-2.0

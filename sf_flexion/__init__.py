@@ -1,0 +1,3 @@
+"""The flexion block."""
+
+# SPDX-License-Identifier: Apache-2.0

@@ -1,0 +1,3 @@
+"""The recon block."""
+
+# SPDX-License-Identifier: Apache-2.0

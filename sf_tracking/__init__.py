@@ -1,0 +1,3 @@
+"""The tracking block."""
+
+# SPDX-License-Identifier: Apache-2.0
