@@ -1,0 +1,118 @@
+"""The colour of a surface point: interpolated features of all levels, decoded by a small network.
+
+Sec. IV-A-2 (encoding) and IV-A-3 (colour prediction). Features live outside the network because only
+the rows near the training pixels are touched in an iteration.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sf_interfaces.types import Float32
+from sf_recon.core.neural_points import Added, NeuralPoints
+
+INITIAL_FEATURE = 0.5
+_BASE_MARGIN = 0.02  # keeps the logit of a black or white base colour finite
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbourhood:
+    """Interpolation of one level: rows ids [N, K] with weights [N, K] that sum to 1 (or all 0: none near)."""
+
+    ids: Tensor
+    weights: Tensor
+
+
+def gaussian_weights(distance2: Float32, sigma: float) -> Float32:
+    """Normalised exp(-d2 / sigma) along the last axis; rows without any neighbour (all inf) give zeros.
+
+    The nearest distance is subtracted first: it cancels in the quotient and prevents 0 / 0.
+    """
+    nearest = distance2[..., :1]
+    shifted = np.where(np.isfinite(distance2), distance2 - np.where(np.isfinite(nearest), nearest, 0), np.inf)
+    w = np.exp(-shifted / np.float32(sigma))
+    return (w / np.maximum(w.sum(axis=-1, keepdims=True), 1e-12)).astype(np.float32)
+
+
+class ColorField(torch.nn.Module):
+    """Features of every neural point and the network that turns them into RGB in 0..1."""
+
+    def __init__(
+        self,
+        points: NeuralPoints,
+        *,
+        features: int,
+        hidden: int,
+        neighbours: int,
+        sigma: float,
+        colour_base: bool,
+        threads: int,
+        generator: torch.Generator,
+    ) -> None:
+        super().__init__()
+        self.points = points
+        self.neighbours, self.sigma, self.colour_base, self.threads = neighbours, sigma, colour_base, threads
+        self.features = [torch.zeros(0, features) for _ in points.levels]
+        sizes = [features * len(points.levels), hidden, hidden, 3]
+        layers: list[torch.nn.Module] = []
+        for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
+            linear = torch.nn.Linear(inputs, outputs)
+            torch.nn.init.xavier_uniform_(linear.weight, generator=generator)
+            torch.nn.init.zeros_(linear.bias)
+            layers += [linear, torch.nn.ReLU()]
+        self.network = torch.nn.Sequential(*layers[:-1])
+
+    def grow(self, added: list[Added]) -> None:
+        """Give new points the feature of their nearest older point, or the initial one."""
+        for level, new in enumerate(added):
+            old = self.features[level]
+            rows = torch.full((len(new.points), old.shape[1]), INITIAL_FEATURE)
+            copied = torch.from_numpy(new.parents >= 0)
+            rows[copied] = old[torch.from_numpy(new.parents).long()[copied]]
+            self.features[level] = torch.cat([old, rows])
+
+    def neighbourhoods(self, queries: Float32) -> list[Neighbourhood]:
+        """Nearest points and their weights on each level for queries [N, 3] m, map frame."""
+        found = []
+        for level in self.points.levels:
+            ids, d2 = level.nearest(queries, self.neighbours, self.threads)
+            weights = gaussian_weights(d2, self.sigma * level.spacing**2)
+            found.append(Neighbourhood(torch.from_numpy(np.maximum(ids, 0)), torch.from_numpy(weights)))
+        return found
+
+    def encode(self, near: list[Neighbourhood]) -> Tensor:
+        """Interpolated features of all levels, [N, levels * features]."""
+        parts = []
+        for features, n in zip(self.features, near, strict=True):
+            if len(features) == 0:
+                parts.append(torch.zeros(len(n.ids), features.shape[1]))
+            else:
+                parts.append(_interpolate(features, n))
+        return torch.cat(parts, dim=1)
+
+    def decode(self, encoded: Tensor, near: list[Neighbourhood]) -> Tensor:
+        """RGB [N, 3] in 0..1 of encoded points [N, levels * features]."""
+        out = self.network(encoded)
+        if self.colour_base and len(self.points.levels[0]):
+            base = _interpolate(torch.from_numpy(self.points.levels[0].colors), near[0])
+            out = out + torch.logit(base, eps=_BASE_MARGIN)
+        return torch.sigmoid(out)
+
+    @torch.no_grad()
+    def color(self, queries: Float32, batch: int = 65536) -> Float32:
+        """RGB [N, 3] in 0..1 of surface points [N, 3] m, map frame."""
+        out = [np.zeros((0, 3), np.float32)]
+        for start in range(0, len(queries), batch):
+            near = self.neighbourhoods(queries[start : start + batch])
+            out.append(self.decode(self.encode(near), near).numpy())
+        return np.concatenate(out)
+
+
+def _interpolate(rows: Tensor, near: Neighbourhood) -> Tensor:
+    """Weighted sum of the neighbours' rows, [N, C]."""
+    return torch.nn.functional.embedding_bag(near.ids, rows, per_sample_weights=near.weights, mode="sum")
