@@ -18,7 +18,7 @@ from sf_interfaces.config import option
 from sf_interfaces.errors import CalibrationError, SceneFactoryError
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.lidar import deskew, project_sweep
-from sf_interfaces.geometry.undistort import Undistorter
+from sf_interfaces.geometry.undistort import Distortion, undistort_depth, undistort_image
 from sf_interfaces.ros.frames import FrameTree
 from sf_interfaces.types import Camera, DepthMap, Float64, Frame, PointCloud, SparseDepth, UInt8, check_pose
 
@@ -144,7 +144,7 @@ class FrameAssembler:
         self.reasons: dict[str, int] = {}
         self.epoch = 0
         self.transforms = FrameTree()
-        self._cameras: dict[str, tuple[Camera, Undistorter | None]] = {}
+        self._cameras: dict[str, tuple[Camera, Distortion | None]] = {}
         self._pending: deque[_Item] = deque()
         wanted = {"image": config.image, "depth": config.depth, "lidar": config.lidar, "pose": config.pose}
         wanted[config.leader] = True
@@ -184,16 +184,15 @@ class FrameAssembler:
         """
         self._push("pose", stamp_ns, check_pose(T, "given pose"), "")
 
-    def push_camera(self, camera: Camera, undistort: Undistorter | None = None) -> None:
+    def push_camera(self, camera: Camera, distortion: Distortion | None = None) -> None:
         """The calibration of ``camera.frame_id``. The first one holds; a different one is refused.
 
         Args:
-            camera: intrinsics of the raw image.
-            undistort: maps the raw image to the pinhole camera ``undistort.camera``, None if there is
-                no distortion.
+            camera: intrinsics; they stay those of the undistorted image.
+            distortion: the lens distortion still in the images, taken out when a frame is assembled.
         """
-        known = self._cameras.setdefault(camera.frame_id, (camera, undistort))
-        if known[0] != camera:
+        known = self._cameras.setdefault(camera.frame_id, (camera, distortion))
+        if known != (camera, distortion):
             self._count("camera_info changed within the stream: the first calibration is kept")
 
     def push_transform(
@@ -284,35 +283,32 @@ class FrameAssembler:
     def _assemble(self, item: _Item) -> Frame | None:
         if item.frame_id not in self._cameras:
             raise CalibrationError(self._no_camera(item.frame_id))
-        raw_camera, undistort = self._cameras[item.frame_id]
-        camera = undistort.camera if undistort else raw_camera
+        camera, distortion = self._cameras[item.frame_id]
         T, twist = self._pose(item, camera.frame_id) if self.config.pose else (None, self._twist())
         if self.config.pose and T is None:
             return None
-        depth = self._depth(item, undistort)
-        image = item.value if self.config.image else None
-        if undistort is not None and image is not None:
-            image = undistort.image(image)
+        depth = self._depth(item)
+        if depth is not None:
+            depth = undistort_depth(depth, camera, distortion)
+        image = undistort_image(item.value, camera, distortion) if self.config.image else None
         sparse = self._sparse(item, camera, twist) if self.config.lidar else None
         return Frame(item.key.stamp_ns, camera, image, depth, sparse, T)
 
-    def _depth(self, item: _Item, undistort: Undistorter | None) -> DepthMap | None:
+    def _depth(self, item: _Item) -> DepthMap | None:
         if not self.config.image:
-            depth: DepthMap = item.value
-        elif not self.config.depth:
+            return item.value
+        if not self.config.depth:
             return None
-        else:
-            found = self._streams["depth"].nearest(item.key, self.config.depth_slop_s)
-            if found is None:
-                self._count(f"image without depth within {self.config.depth_slop_s:g} s")
-                return None
-            if found.frame_id != item.frame_id and not self.config.depth_registered:
-                raise CalibrationError(
-                    f"depth is in frame '{found.frame_id}', the image in '{item.frame_id}'; register depth to "
-                    "the image, or set sync.depth_registered if it is registered"
-                )
-            depth = found.value
-        return undistort.depth(depth) if undistort is not None else depth
+        found = self._streams["depth"].nearest(item.key, self.config.depth_slop_s)
+        if found is None:
+            self._count(f"image without depth within {self.config.depth_slop_s:g} s")
+            return None
+        if found.frame_id != item.frame_id and not self.config.depth_registered:
+            raise CalibrationError(
+                f"depth is in frame '{found.frame_id}', the image in '{item.frame_id}'; register depth to "
+                "the image, or set sync.depth_registered if it is registered"
+            )
+        return found.value
 
     def _sparse(self, item: _Item, camera: Camera, twist: Float64 | None) -> SparseDepth | None:
         found = self._streams["lidar"].nearest(item.key, self.config.lidar_slop_s)
