@@ -94,7 +94,8 @@ def adjust(
         H, b = _normal_equations(camera, T_cw, edges, free, slot, n, scale)
         step = np.linalg.solve(H + np.diag(damping * np.diag(H) + 1e-9), b)
         trial = T_cw.copy()
-        trial[free] = se3.exp(step.reshape(n, 6)) @ T_cw[free]
+        # Poses are products of products: without this their rotations drift from orthonormal frame by frame.
+        trial[free] = se3.orthonormalise(se3.exp(step.reshape(n, 6)) @ T_cw[free])
         trial_cost = cost_of(trial)
         if trial_cost > cost:
             damping = max(damping, 1e-6) * 100

@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, DepthMap, Float64, Frame, Keyframe, PointCloud
+from sf_interfaces.types import Camera, DepthMap, Float64, Frame, Keyframe, PointCloud, UInt8
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.bundle import Edges
 from sf_tracking.core.patches import Patches
-from sf_tracking.core.update import Pyramid
 
 
 @dataclass(slots=True)
@@ -20,7 +19,7 @@ class TrackedKeyframe:
     """A keyframe inside the optimisation window; its pose still moves."""
 
     frame: Frame
-    pyramid: Pyramid
+    gray: UInt8
     patches: Patches
     T_cw: Float64  # world to camera
     observed: list[tuple[int, Edges]] = field(default_factory=list)  # (stamp of the source keyframe, its edges)

@@ -13,6 +13,7 @@ from sf_interfaces.types import Camera, Float32, Float64, Frame, SparseDepth, UI
 from sf_tracking.config import TrackingConfig
 
 _NEIGHBOURHOOD = 9  # px, within which a step in depth disqualifies a patch
+_FAR = 1e6  # m, stands for no depth where the nearest is sought
 _GRADIENT_NOISE = 1e-3  # keeps the structure tensor of a flat patch invertible
 
 
@@ -50,7 +51,7 @@ def _continuous_depth(z: Float32, gap: float) -> NDArray[np.bool_]:
     known = np.isfinite(z)
     kernel = np.ones((_NEIGHBOURHOOD, _NEIGHBOURHOOD), np.uint8)
     far = cv2.dilate(np.where(known, z, 0.0).astype(np.float32), kernel)
-    near = cv2.erode(np.where(known, z, np.inf).astype(np.float32), kernel)
+    near = cv2.erode(np.where(known, z, _FAR).astype(np.float32), kernel)
     return np.asarray(known & (far < (1.0 + gap) * near))
 
 

@@ -9,10 +9,9 @@ import cv2
 import numpy as np
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, Float64
+from sf_interfaces.types import Camera, Float64, UInt8
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.keyframes import TrackedKeyframe
-from sf_tracking.core.update import Pyramid
 
 _FEATURES = 1500
 _RATIO = 0.8  # Lowe's ratio between best and second match
@@ -20,7 +19,7 @@ _PNP_PX = 3.0
 
 
 def relocate(
-    keyframes: Sequence[TrackedKeyframe], pyramid: Pyramid, camera: Camera, config: TrackingConfig
+    keyframes: Sequence[TrackedKeyframe], gray: UInt8, camera: Camera, config: TrackingConfig
 ) -> Float64 | None:
     """Pose T_cw of an image against the patches of recent keyframes, or None.
 
@@ -28,7 +27,7 @@ def relocate(
     the image; PnP with RANSAC and a refinement on the inliers follow.
     """
     orb = cv2.ORB_create(nfeatures=_FEATURES)
-    corners, descriptors = orb.detectAndCompute(pyramid.gray, None)
+    corners, descriptors = orb.detectAndCompute(gray, None)
     if descriptors is None or len(corners) < config.min_inliers:
         return None
     matcher = cv2.BFMatcher(cv2.NORM_HAMMING)
@@ -51,12 +50,12 @@ def _described(orb: cv2.ORB, keyframe: TrackedKeyframe) -> tuple[list[int], np.n
     """Indices of the patches that ORB could describe, and their descriptors."""
     uv = keyframe.patches.uv - 0.5
     points = [cv2.KeyPoint(float(u), float(v), 31.0, -1.0, 0.0, 0, i) for i, (u, v) in enumerate(uv)]
-    angled = orb.detect(keyframe.pyramid.gray, None)
+    angled = orb.detect(keyframe.gray, None)
     if angled:  # a patch takes the orientation of the nearest corner, so that rotation does not break matching
         spots = np.array([k.pt for k in angled])
         for point in points:
             point.angle = angled[int(np.argmin(np.abs(spots - point.pt).sum(axis=1)))].angle
-    kept, descriptors = orb.compute(keyframe.pyramid.gray, points)
+    kept, descriptors = orb.compute(keyframe.gray, points)
     return [k.class_id for k in kept], descriptors
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Trajectory
+from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Trajectory, UInt8
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.bundle import Edges, adjust, residuals
 from sf_tracking.core.keyframes import TrackedKeyframe, wants_keyframe
 from sf_tracking.core.patches import extract, to_gray
 from sf_tracking.core.search import relocate
-from sf_tracking.core.update import PatchAlignment, Pyramid, UpdateOperator
+from sf_tracking.core.update import PatchAlignment, UpdateOperator
 
 
 class TrackingState(Enum):
@@ -70,16 +70,16 @@ class Tracker:
         """
         camera = self._check(frame)
         assert frame.image is not None
-        pyramid = self._operator.pyramid(to_gray(frame.image))
+        gray = self._operator.prepare(to_gray(frame.image))
         if not self._window:
-            return self._start(frame, pyramid)
-        T_cw, edges, inliers = self._locate(frame, pyramid, camera)
+            return self._start(frame, gray)
+        T_cw, edges, inliers = self._locate(frame, gray, camera)
         if T_cw is None:
             self.state = TrackingState.LOST
             self._recent.clear()
             return TrackingUpdate(frame.stamp_ns, None, self.state, edges=len(edges))
         self.state = TrackingState.TRACKING
-        finished = self._remember(frame, pyramid, camera, T_cw, edges)
+        finished = self._remember(frame, gray, camera, T_cw, edges)
         T_map_camera = self._pose_of(frame.stamp_ns)
         self._recent = [*self._recent, (frame.stamp_ns, se3.inverse(T_map_camera))][-2:]
         return TrackingUpdate(
@@ -112,12 +112,12 @@ class Tracker:
             raise FormatError("the camera changed within the sequence; start a new run for another camera")
         return frame.camera
 
-    def _start(self, frame: Frame, pyramid: Pyramid) -> TrackingUpdate:
+    def _start(self, frame: Frame, gray: UInt8) -> TrackingUpdate:
         """The first frame with enough measured patches fixes the map's origin."""
-        patches = extract(frame, pyramid.gray, self._config)
+        patches = extract(frame, gray, self._config)
         if len(patches) < self._config.min_inliers:
             return TrackingUpdate(frame.stamp_ns, None, self.state)
-        self._window.append(TrackedKeyframe(frame, pyramid, patches, np.eye(4)))
+        self._window.append(TrackedKeyframe(frame, gray, patches, np.eye(4)))
         self._recent = [(frame.stamp_ns, np.eye(4))]
         self.state = TrackingState.TRACKING
         return TrackingUpdate(frame.stamp_ns, np.eye(4), self.state)
@@ -132,28 +132,28 @@ class Tracker:
         share = self._config.damping + (1 - self._config.damping) * float(ratio <= 1.5)
         return se3.exp(share * ratio * se3.log(T1 @ se3.inverse(T0))) @ T1
 
-    def _locate(self, frame: Frame, pyramid: Pyramid, camera: Camera) -> tuple[Float64 | None, Edges, int]:
+    def _locate(self, frame: Frame, gray: UInt8, camera: Camera) -> tuple[Float64 | None, Edges, int]:
         """Pose from the prediction; failing that with the full search range; failing that by descriptors."""
         known = len(self._recent) == 2
         attempts = ([(self._predict(frame.stamp_ns), False)] if known else []) + [(self._predict(frame.stamp_ns), True)]
         edges = Edges.concatenate([])
         for start, wide in attempts:
-            T_cw, edges, inliers = self._align(pyramid, camera, start, wide)
+            T_cw, edges, inliers = self._align(gray, camera, start, wide)
             if T_cw is not None:
                 return T_cw, edges, inliers
-        found = relocate(self._window[-self._config.lifetime :], pyramid, camera, self._config)
+        found = relocate(self._window[-self._config.lifetime :], gray, camera, self._config)
         if found is not None:
-            T_cw, edges, inliers = self._align(pyramid, camera, found, False)
+            T_cw, edges, inliers = self._align(gray, camera, found, False)
             return T_cw, edges, inliers
         return None, edges, 0
 
     def _align(
-        self, pyramid: Pyramid, camera: Camera, T_cw: Float64, wide: bool
+        self, gray: UInt8, camera: Camera, T_cw: Float64, wide: bool
     ) -> tuple[Float64 | None, Edges, int]:
         """Edges of all recent patches to the image and the pose they agree on (None: too few agree)."""
         sources = self._window[-self._config.lifetime :]
         for repeat in range(3 if wide else 1):
-            edges = self._edges(sources, pyramid, camera, T_cw, wide and repeat == 0)
+            edges = self._edges(sources, gray, camera, T_cw, wide and repeat == 0)
             poses = np.stack([*(k.T_cw for k in sources), T_cw])
             free = np.arange(len(poses)) == len(sources)
             # Far from the truth the kernel has to be wide, or it would reject the right edges.
@@ -166,7 +166,7 @@ class Tracker:
         return (T_cw if enough else None), edges, inliers
 
     def _edges(
-        self, sources: list[TrackedKeyframe], pyramid: Pyramid, camera: Camera, T_cw: Float64, wide: bool
+        self, sources: list[TrackedKeyframe], gray: UInt8, camera: Camera, T_cw: Float64, wide: bool
     ) -> Edges:
         """One edge per patch that the update operator finds; poses are numbered as ``sources``, then the image."""
         parts = []
@@ -174,14 +174,14 @@ class Tracker:
             moved = se3.transform(T_cw @ se3.inverse(keyframe.T_cw), keyframe.patches.points)
             start, z = camera.project(moved)
             start[z <= 0.1] = np.nan
-            update = self._operator(keyframe.pyramid, keyframe.patches, pyramid, start, wide=wide)
+            update = self._operator(keyframe.gray, keyframe.patches, gray, start, wide=wide)
             ok = update.valid
             ends = np.full(int(ok.sum()), index), np.full(int(ok.sum()), len(sources))
             parts.append(Edges(*ends, keyframe.patches.points[ok], update.target[ok], update.information[ok]))
         return Edges.concatenate(parts)
 
     def _remember(
-        self, frame: Frame, pyramid: Pyramid, camera: Camera, T_cw: Float64, edges: Edges
+        self, frame: Frame, gray: UInt8, camera: Camera, T_cw: Float64, edges: Edges
     ) -> tuple[Keyframe, ...]:
         """Store the frame relative to the newest keyframe, or make it a keyframe and optimise the window."""
         newest = self._window[-1]
@@ -192,16 +192,16 @@ class Tracker:
         share = float(own.sum()) / max(1, len(newest.patches))
         patches = None
         if wants_keyframe(self._config, camera, flow, share):
-            patches = extract(frame, pyramid.gray, self._config)
+            patches = extract(frame, gray, self._config)
         if patches is None or len(patches) < self._config.min_inliers:
             self._relative[frame.stamp_ns] = (newest.frame.stamp_ns, newest.T_cw @ se3.inverse(T_cw))
             return ()
-        keyframe = TrackedKeyframe(frame, pyramid, patches, T_cw)
+        keyframe = TrackedKeyframe(frame, gray, patches, T_cw)
         for index, source in enumerate(sources):
             mine = edges.source == index
             part = Edges(*(getattr(edges, name)[mine] for name in ("source", "target", "points", "uv", "information")))
             keyframe.observed.append((source.frame.stamp_ns, part))
-            source.observed.append((frame.stamp_ns, self._edges([keyframe], source.pyramid, camera, source.T_cw, False)))
+            source.observed.append((frame.stamp_ns, self._edges([keyframe], source.gray, camera, source.T_cw, False)))
         self._window.append(keyframe)
         self._optimise(camera)
         return (self._retire(),) if len(self._window) > self._config.window else ()

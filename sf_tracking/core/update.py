@@ -3,7 +3,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -16,15 +15,8 @@ from sf_tracking.config import TrackingConfig
 from sf_tracking.core.patches import Patches
 
 _REACH = 0.5  # of the patch side: how far alignment may move a patch on the finest level of a known motion
+_CONTRAST, _MIDDLE = 45.0, 128.0  # grey levels of a normalised image: standard deviation and mean
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
-
-
-@dataclass(frozen=True, slots=True)
-class Pyramid:
-    """An image and its reductions, ready for alignment."""
-
-    levels: Sequence[UInt8]
-    gray: UInt8  # [H, W]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +31,12 @@ class Update:
 class UpdateOperator(Protocol):
     """Maps patches of one image and their reprojections into another to corrected positions."""
 
-    def pyramid(self, gray: UInt8) -> Pyramid:
-        """Prepare an image once for all its edges."""
+    def prepare(self, gray: UInt8) -> UInt8:
+        """Prepare an image [H, W] once for all its edges."""
         ...
 
     def __call__(
-        self, source: Pyramid, patches: Patches, target: Pyramid, start: Float64, *, wide: bool
+        self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool
     ) -> Update:
         """Align ``patches`` of ``source`` in ``target``, starting from ``start`` [M, 2] px.
 
@@ -64,21 +56,18 @@ class PatchAlignment:
         self._config = config
         self._window = (config.patch_px, config.patch_px)
 
-    def pyramid(self, gray: UInt8) -> Pyramid:
-        """Gaussian pyramid down to the coarsest level that a wide search uses."""
-        # Contrast is normalised so that exposure changes do not read as motion.
+    def prepare(self, gray: UInt8) -> UInt8:
+        """The image in normal contrast, so that changes of exposure do not read as motion."""
         mean, deviation = cv2.meanStdDev(gray)
-        gain = 45.0 / max(float(deviation[0, 0]), 1.0)
-        normal = np.clip((gray.astype(np.float32) - mean[0, 0]) * gain + 128.0, 0, 255).astype(np.uint8)
-        _, levels = cv2.buildOpticalFlowPyramid(normal, self._window, self._config.wide_levels)
-        return Pyramid(levels, normal)
+        gain = _CONTRAST / max(float(deviation[0, 0]), 1.0)
+        return np.asarray(cv2.convertScaleAbs(gray, alpha=gain, beta=_MIDDLE - gain * float(mean[0, 0])))
 
     def _flow(
-        self, a: Pyramid, b: Pyramid, points: NDArray[np.float32], start: NDArray[np.float32], levels: int
+        self, a: UInt8, b: UInt8, points: NDArray[np.float32], start: NDArray[np.float32], levels: int
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
         found, status, error = cv2.calcOpticalFlowPyrLK(
-            a.levels,
-            b.levels,
+            a,
+            b,
             points,
             start.copy(),
             winSize=self._window,
@@ -87,17 +76,19 @@ class PatchAlignment:
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=1e-5,
         )
-        return found, status.ravel().astype(bool), error.ravel()
+        ok = status.ravel().astype(bool)
+        # OpenCV leaves position and error undefined where it found nothing.
+        return np.where(ok[:, None], found, points), ok, np.where(ok, error.ravel(), 0.0)
 
     def __call__(
-        self, source: Pyramid, patches: Patches, target: Pyramid, start: Float64, *, wide: bool
+        self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool
     ) -> Update:
         """See :class:`UpdateOperator`."""
         c = self._config
         count = len(patches)
         if count == 0:
             return Update(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
-        height, width = target.gray.shape
+        height, width = target.shape
         levels = c.wide_levels if wide else c.levels
         # OpenCV counts pixel centres from 0, the project from 0.5.
         points = (patches.uv - 0.5).astype(np.float32)
