@@ -1,7 +1,8 @@
 """Throughput of player -> recorder in separate processes: VGA colour and depth at a multiple of 30 Hz.
 
 The images are crops of a smooth random texture with sensor noise, so they compress about as camera images
-do. A rate counts as sustained when no message is lost, the recording took no longer than it should, and little waited for the disk at its end.
+do. A rate counts as sustained when no message is lost, the recording took no longer than it should, and little
+waited for the disk at its end.
 """
 
 # SPDX-License-Identifier: Apache-2.0
