@@ -200,10 +200,11 @@ class BagReader:
         for connection, stamp, data in self._any.messages(connections) if connections else ():
             kind = self.topics[connection.topic].type
             if not self._any.is2:
-                data = migrate_bytes(
+                converted = migrate_bytes(
                     self._any.typestore, self._store, connection.msgtype, kind, cache, data,
                     src_is2=False, dst_is2=True,
                 )  # fmt: skip
+                data = bytes(converted)
             yield RawMessage(connection.topic, kind, stamp, bytes(data))
 
     def decode(self, raw: RawMessage) -> Any:

@@ -59,7 +59,8 @@ def qos_yaml(reliable: bool = True, latched: bool = False) -> str:
 def _bytes(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
-    return builder.end()
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
 
 
 class McapWriter:

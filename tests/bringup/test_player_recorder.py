@@ -130,3 +130,43 @@ def test_a_killed_recorder_leaves_a_readable_file(sample: Path, tmp_path: Path) 
         recorder.communicate()
     with BagReader(out) as bag:
         assert bag.torn and bag.topics["/camera/color/image_raw"].count == 40
+
+
+def test_lossless_play_waits_for_credits(sample: Path) -> None:
+    """A consumer that gives one credit per 20 ms never has more than N images waiting, and gets all."""
+    rclpy = pytest.importorskip("rclpy")
+    from builtin_interfaces.msg import Time
+    from rclpy.executors import SingleThreadedExecutor
+    from sensor_msgs.msg import Image
+
+    domain = 40 + os.getpid() % 20
+    environment = node_environment(domain) | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=domain)
+    node = rclpy.create_node("consumer", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    waiting: list[Time] = []
+    received, most = 0, 0
+    topic = "/camera/color/image_raw"
+    node.create_subscription(Image, topic, lambda msg: waiting.append(msg.header.stamp), 100)
+    credit = node.create_publisher(Time, "/sf/test/consumed", 100)
+    command = [sys.executable, "-m", "sf_bringup.player", str(sample), "--lossless", "--in-flight", "4"]
+    player = subprocess.Popen([*command, "--consumed", "/sf/test/consumed"], env=environment)
+    try:
+        until = time.monotonic() + 30
+        while player.poll() is None and time.monotonic() < until:
+            executor.spin_once(timeout_sec=0.02)
+            while (
+                len(waiting) > most and executor.spin_once(timeout_sec=0.02) is None and len(waiting) > most
+            ):
+                most = len(waiting)
+            if waiting:
+                time.sleep(0.02)
+                credit.publish(waiting.pop(0))
+                received += 1
+        assert player.wait(timeout=5) == 0
+        assert received == 40 and 1 < most <= 4
+    finally:
+        player.kill()
+        rclpy.try_shutdown(context=context)
