@@ -1,4 +1,4 @@
-"""Improved Point Rasterization in numpy: the definition of the kernel and the oracle of its tests (Sec. IV-C).
+"""Improved Point Rasterization in numpy: definition of the kernel, oracle of its tests (Sec. IV-C).
 
 1. A point covers the pixels whose centre lies in a window of side ``coverage * resolution * f / z`` around
    its projection (at least one pixel wide, at most ``2 * max_half``). The paper's adaptive radius: near
@@ -8,7 +8,7 @@
    (z_t - z_{t-1} for t > 0, cumulative product). The paper's formula has z_{t+1} - z_t, which would drop the
    last point of the front surface.
 4. The drawn position is their mean with weights exp(-q2 / sigma), q the offset from the pixel centre in
-   half-widths. The released code draws depth at integer pixels; here pixel centres are at + 0.5, as in training.
+   half-widths. Pixel centres are at + 0.5, as in training.
 """
 
 # SPDX-License-Identifier: Apache-2.0

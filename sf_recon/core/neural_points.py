@@ -80,7 +80,7 @@ class Level:
         self._points, self._colors = [points], [colors]
 
     def nearest(self, queries: Float32, k: int, threads: int = 0) -> tuple[Int32, Float32]:
-        """Ids [N, k] (-1: none) and squared distances [N, k] m^2 (inf), nearest first, within four spacings."""
+        """Ids [N, k] (-1: none) and squared distances [N, k] m^2 (inf), nearest first, in four spacings."""
         radius = SEARCH_RADIUS * self.spacing
         ids, d2 = self._grid.knn(np.ascontiguousarray(queries, dtype=np.float32), k, radius, threads)
         return ids, d2

@@ -89,7 +89,7 @@ class Reconstruction:
         return self._colored(self._points.levels[0].points)
 
     def render(self, camera: Camera, T_map_camera: Float64) -> RenderedView:
-        """Draw the surface from a pose: first layer of points, then the colour of the field where rays hit it."""
+        """Draw the surface from a pose: the first layer of points, then the field's colour where rays hit."""
         image = np.zeros((camera.height * camera.width, 3), np.uint8)
         z = self._surface_depth(camera, T_map_camera)
         hit = np.flatnonzero(np.isfinite(z).reshape(-1))

@@ -126,12 +126,12 @@ class Trainer:
         loss = (torch.from_numpy(view.weights[pick]).float()[:, None] * error.square()).mean()
         self._network.zero_grad()
         # Adam does not see the scale of a loss; the sum keeps small gradients out of the denormal range.
-        (loss * self.pixels).backward()
+        (loss * self.pixels).backward()  # type: ignore[no-untyped-call]
         for group in self._network.param_groups:
             group["lr"] = factor * self.network_rate
         self._network.step()
         assert encoded.grad is not None
-        gradients = encoded.grad.split([f.shape[1] for f in self.field.features], dim=1)
+        gradients = torch.split(encoded.grad, [f.shape[1] for f in self.field.features], dim=1)
         for adam, table, n, gradient in zip(self._rows, self.field.features, near, gradients, strict=True):
             adam.step(table, n, gradient, factor * self.feature_rate)
         return float(loss.detach())

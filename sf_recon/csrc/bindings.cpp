@@ -42,8 +42,7 @@ nb::tuple knn(const sf::PointGrid& grid, Points queries, int k, float radius, in
     std::unique_ptr<int32_t[]> ids(new int32_t[n * k]);
     std::unique_ptr<float[]> distance2(new float[n * k]);
     bool outside = false;
-    {
-        nb::gil_scoped_release release;
+    {  // the interpreter lock stays held: another thread must not add points meanwhile
         const int team = threads > 0 ? threads : omp_get_max_threads();
 #pragma omp parallel for schedule(dynamic, 256) num_threads(team) reduction(|| : outside)
         for (size_t i = 0; i < n; ++i) {
