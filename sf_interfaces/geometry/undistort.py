@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,9 +51,8 @@ def _maps(camera: Camera, distortion: Distortion) -> tuple[Float32, Float32]:
     K[:2, 2] -= 0.5  # OpenCV has pixel centres at integers
     size = (camera.width, camera.height)
     coefficients = np.array(distortion.coefficients)
-    init = cv2.initUndistortRectifyMap
-    if distortion.model == "equidistant":
-        init = cv2.fisheye.initUndistortRectifyMap
+    fisheye = distortion.model == "equidistant"
+    init: Any = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = init(K, coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     return x, y
 

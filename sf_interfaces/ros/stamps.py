@@ -47,5 +47,5 @@ def sequence(cls: Any, values: NDArray[Any]) -> Any:
     if hasattr(cls, "__dataclass_fields__"):
         return flat
     out = array.array(_TYPECODES[flat.dtype.name])
-    out.frombytes(memoryview(flat).cast("B"))
+    out.frombytes(flat.view(np.uint8).data)
     return out
