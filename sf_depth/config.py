@@ -1,0 +1,29 @@
+"""Configuration of the depth block."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sf_interfaces.config import option
+
+
+@dataclass(frozen=True, slots=True)
+class DepthConfig:
+    """How sparse depth becomes dense depth with variance (paper Sec. ScaleCov)."""
+
+    neighbours: int = option(24, "observations each tile of pixels is conditioned on", low=4, high=128)
+    tile: int = option(4, "side in px of the tiles that share their observations", low=1, high=32)
+    length_scale: float = option(
+        0.0, "correlation length in mean point spacings; 0 = most likely one per image", low=0.0, high=64.0
+    )
+    color_scale: float = option(
+        0.15, "colour difference (0..1) over which correlation falls to 0.6", low=0.01, high=10.0
+    )
+    edge_strength: float = option(
+        1.0, "how much correlation shortens across image edges; 0 = not at all", low=0.0, high=100.0
+    )
+    nugget: float = option(0.01, "noise variance of an observation relative to the prior", low=1e-5, high=1.0)
+    depth_sigma: float = option(0.03, "noise of a measured depth, m (1 sigma)", low=1e-5, high=10.0)
+    max_sigma: float = option(0.0, "pixels less certain than this, m, become NaN; 0 = keep all", low=0.0)
+    seed: int = option(0, "seed of the subset the length scale is estimated on", low=0)

@@ -1,0 +1,3 @@
+"""The flexion image; importable without ROS."""
+
+# SPDX-License-Identifier: Apache-2.0
