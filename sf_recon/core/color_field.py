@@ -36,7 +36,8 @@ def gaussian_weights(distance2: Float32, sigma: float) -> Float32:
     nearest = distance2[..., :1]
     shifted = np.where(np.isfinite(distance2), distance2 - np.where(np.isfinite(nearest), nearest, 0), np.inf)
     w = np.exp(-shifted / np.float32(sigma))
-    return (w / np.maximum(w.sum(axis=-1, keepdims=True), 1e-12)).astype(np.float32)
+    normalised: Float32 = (w / np.maximum(w.sum(axis=-1, keepdims=True), 1e-12)).astype(np.float32)
+    return normalised
 
 
 class ColorField(torch.nn.Module):

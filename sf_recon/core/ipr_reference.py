@@ -1,4 +1,4 @@
-"""Improved Point Rasterization in numpy: the definition of the kernel and the oracle of its tests (Sec. IV-C).
+"""Improved Point Rasterization in numpy: definition of the kernel, oracle of its tests (Sec. IV-C).
 
 1. A point covers the pixels whose centre lies in a window of side ``coverage * resolution * f / z`` around
    its projection (at least one pixel wide, at most ``2 * max_half``). The paper's adaptive radius: near
@@ -8,7 +8,7 @@
    (z_t - z_{t-1} for t > 0, cumulative product). The paper's formula has z_{t+1} - z_t, which would drop the
    last point of the front surface.
 4. The drawn position is their mean with weights exp(-q2 / sigma), q the offset from the pixel centre in
-   half-widths. The released code draws depth at integer pixels; here pixel centres are at + 0.5, as in training.
+   half-widths. Pixel centres are at + 0.5, as in training.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -51,7 +51,8 @@ def rasterize_reference(
 ) -> Raster:
     """Draw points [N, 3] (map frame). Slow: one step of Python per covered pixel."""
     p, T = points.astype(np.float32), T_camera_map.astype(np.float32)
-    x, y, z = (p[:, 0] * r[0] + p[:, 1] * r[1] + p[:, 2] * r[2] + r[3] for r in T[:3])
+    with np.errstate(invalid="ignore"):
+        x, y, z = (p[:, 0] * r[0] + p[:, 1] * r[1] + p[:, 2] * r[2] + r[3] for r in T[:3])
     fx, fy, cx, cy = (np.float32(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
     lists: dict[tuple[int, int], list[tuple[float, int]]] = {}
     visible = np.isfinite(x) & np.isfinite(y) & np.isfinite(z) & (z >= np.float32(options.near))
@@ -73,7 +74,9 @@ def rasterize_reference(
         ids = np.array([i for _, i in sorted(hits)[: options.k_ray]])
         step_ok = np.concatenate([[True], np.diff(z[ids]) < np.float32(options.layer_gap)])
         first = ids[np.cumprod(step_ok).astype(bool)]
-        q2 = ((column + 0.5 - u[first]) / half[first, 0]) ** 2 + ((row + 0.5 - v[first]) / half[first, 1]) ** 2
+        q2 = ((column + 0.5 - u[first]) / half[first, 0]) ** 2 + (
+            (row + 0.5 - v[first]) / half[first, 1]
+        ) ** 2
         w = np.exp(-q2 / options.sigma)
         position[row, column] = (w / w.sum()) @ xyz[first]
         depth[row, column] = position[row, column, 2]

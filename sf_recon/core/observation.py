@@ -61,13 +61,14 @@ def observe(keyframe: Keyframe, config: ReconConfig) -> Observation:
         largest = (config.max_relative_sigma * np.where(usable, z, 1)) ** 2
         with np.errstate(invalid="ignore"):
             usable = usable & (variance <= largest)
-        weights = largest / np.maximum(np.where(usable, variance, largest), _SIGMA_FLOOR**2 * largest)
+        known = np.where(usable, variance, largest)
+        weights = (largest / np.maximum(known, _SIGMA_FLOOR**2 * largest)).astype(np.float32)
     pixels = np.flatnonzero(usable)
     kept = weights[pixels]
     return Observation(
         pixels=pixels,
         points=to_map(camera, keyframe.T_map_camera, depth.z, pixels),
-        colors=rgb(keyframe.image).reshape(-1, 3)[pixels].astype(np.float32) / 255,
+        colors=rgb(keyframe.image).reshape(-1, 3)[pixels].astype(np.float32) / np.float32(255),
         weights=(kept / max(float(kept.mean()), 1e-12) if len(kept) else kept).astype(np.float32),
     )
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -63,5 +64,5 @@ def make_rasterizer(config: ReconConfig) -> Rasterizer:
     if config.rasterizer == "reference":
         return rasterize_reference
     if config.rasterizer == "native":
-        return lambda *args: rasterize(*args, threads=config.threads)
+        return partial(rasterize, threads=config.threads)
     raise ConfigError(f"recon.rasterizer must be native or reference, got '{config.rasterizer}'")

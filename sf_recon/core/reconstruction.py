@@ -89,7 +89,7 @@ class Reconstruction:
         return self._colored(self._points.levels[0].points)
 
     def render(self, camera: Camera, T_map_camera: Float64) -> RenderedView:
-        """Draw the surface from a pose: first layer of points, then the colour of the field where rays hit it."""
+        """Draw the surface from a pose: the first layer of points, then the field's colour where rays hit."""
         image = np.zeros((camera.height * camera.width, 3), np.uint8)
         z = self._surface_depth(camera, T_map_camera)
         hit = np.flatnonzero(np.isfinite(z).reshape(-1))
@@ -166,8 +166,12 @@ class Reconstruction:
 
     def _training_view(self, seen: Observation) -> TrainingView:
         count = min(self.config.keyframe_pixels, len(seen.points))
-        kept = np.sort(self._rng.choice(len(seen.points), count, replace=False)) if count else np.zeros(0, int)
-        return TrainingView(seen.points[kept], seen.colors[kept], seen.weights[kept])
+        kept = (
+            np.sort(self._rng.choice(len(seen.points), count, replace=False)) if count else np.zeros(0, int)
+        )
+        return TrainingView(
+            seen.points[kept], _to_uint8(seen.colors[kept]), seen.weights[kept].astype(np.float16)
+        )
 
     def _colored(self, points: Float32) -> PointCloud:
         return PointCloud(points, _to_uint8(self._field.color(points)), frame_id="map")

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from sf_interfaces.types import Float32
+from sf_interfaces.types import Float32, UInt8
 from sf_recon.core.color_field import ColorField, Neighbourhood
+from sf_recon.core.native import native
 
 BETAS = (0.9, 0.99)
 EPSILON = 1e-15
@@ -32,6 +34,7 @@ class RowAdam:
         self.square = torch.zeros(0, columns)
         self.steps = torch.zeros(0)
         self._gradient = torch.zeros(0, columns)
+        self._marks = torch.zeros(0, dtype=torch.uint8)
 
     def grow(self, rows: int) -> None:
         """Extend to a table of ``rows``; the moments of the old rows stay."""
@@ -40,15 +43,18 @@ class RowAdam:
         self.square = torch.nn.functional.pad(self.square, (0, 0, 0, new))
         self.steps = torch.nn.functional.pad(self.steps, (0, new))
         self._gradient = torch.zeros_like(self.mean)
+        self._marks = torch.zeros(rows, dtype=torch.uint8)
 
     def step(self, table: Tensor, near: Neighbourhood, gradient: Tensor, rate: float) -> None:
         """Move the rows that were interpolated, given the loss gradient [N, C] of the interpolated values."""
-        ids = near.ids.reshape(-1)
-        per_row = (near.weights[:, :, None] * gradient[:, None, :]).reshape(-1, gradient.shape[1])
-        self._gradient.index_add_(0, ids, per_row)
-        touched = torch.zeros(len(self.steps), dtype=torch.bool)
-        touched[ids[near.weights.reshape(-1) > 0].long()] = True  # not row 0, which stands for no neighbour
-        rows = touched.nonzero()[:, 0]
+        touched = native().accumulate_rows(
+            near.ids.numpy(),
+            near.weights.numpy(),
+            gradient.contiguous().numpy(),
+            self._gradient.numpy(),
+            self._marks.numpy(),
+        )
+        rows = torch.from_numpy(touched)
         g = self._gradient[rows]
         self._gradient[rows] = 0.0
         mean = torch.lerp(g, self.mean[rows], BETAS[0])
@@ -62,11 +68,11 @@ class RowAdam:
 
 @dataclass(slots=True)
 class TrainingView:
-    """The pixels of one keyframe that are kept for training."""
+    """The pixels of one keyframe that are kept for training, 17 bytes each."""
 
     points: Float32  # [M, 3] m, map frame
-    colors: Float32  # [M, 3] in 0..1
-    weights: Float32  # [M] confidence, mean 1
+    colors: UInt8  # [M, 3]
+    weights: NDArray[np.float16]  # [M] confidence, mean 1
     turns: int = 0
 
 
@@ -90,7 +96,9 @@ class Trainer:
         self.iteration = 0
         self.losses: list[float] = []
         self._rows = [RowAdam(f.shape[1]) for f in field.features]
-        self._network = torch.optim.Adam(field.network.parameters(), lr=network_rate, betas=BETAS, eps=EPSILON)
+        self._network = torch.optim.Adam(
+            field.network.parameters(), lr=network_rate, betas=BETAS, eps=EPSILON
+        )
 
     def add(self, view: TrainingView) -> None:
         """Take a new keyframe into the rotation."""
@@ -110,19 +118,20 @@ class Trainer:
         view.turns += 1
         factor = JUMP_FACTOR if self.iteration < self.jump_iterations else 1.0
         self.iteration += 1
-        pick = self._rng.integers(0, len(view.points), self.pixels)
+        # Sorted: neighbouring pixels ask for the same grid cells one after another.
+        pick = np.sort(self._rng.integers(0, len(view.points), self.pixels))
         near = self.field.neighbourhoods(view.points[pick])
         encoded = self.field.encode(near).requires_grad_(True)
-        error = self.field.decode(encoded, near) - torch.from_numpy(view.colors[pick])
-        loss = (torch.from_numpy(view.weights[pick])[:, None] * error.square()).mean()
+        error = self.field.decode(encoded, near) - torch.from_numpy(view.colors[pick]) / 255
+        loss = (torch.from_numpy(view.weights[pick]).float()[:, None] * error.square()).mean()
         self._network.zero_grad()
         # Adam does not see the scale of a loss; the sum keeps small gradients out of the denormal range.
-        (loss * self.pixels).backward()
+        (loss * self.pixels).backward()  # type: ignore[no-untyped-call]
         for group in self._network.param_groups:
             group["lr"] = factor * self.network_rate
         self._network.step()
         assert encoded.grad is not None
-        gradients = encoded.grad.split([f.shape[1] for f in self.field.features], dim=1)
+        gradients = torch.split(encoded.grad, [f.shape[1] for f in self.field.features], dim=1)
         for adam, table, n, gradient in zip(self._rows, self.field.features, near, gradients, strict=True):
             adam.step(table, n, gradient, factor * self.feature_rate)
         return float(loss.detach())

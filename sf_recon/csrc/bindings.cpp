@@ -42,8 +42,7 @@ nb::tuple knn(const sf::PointGrid& grid, Points queries, int k, float radius, in
     std::unique_ptr<int32_t[]> ids(new int32_t[n * k]);
     std::unique_ptr<float[]> distance2(new float[n * k]);
     bool outside = false;
-    {
-        nb::gil_scoped_release release;
+    {  // the interpreter lock stays held: another thread must not add points meanwhile
         const int team = threads > 0 ? threads : omp_get_max_threads();
 #pragma omp parallel for schedule(dynamic, 256) num_threads(team) reduction(|| : outside)
         for (size_t i = 0; i < n; ++i) {
@@ -87,6 +86,31 @@ Out<float> voxel_means(Rows rows, float cell_size) {
     return give(means, columns);
 }
 
+// Transpose of the interpolation: sums[ids[i, j]] += weights[i, j] * gradient[i], in order. Returns the rows that were
+// touched, in order of first touch; `marks` (all 0 between calls) tells which.
+Out<int64_t> accumulate_rows(nb::ndarray<const int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu> ids, Rows weights,
+                             Rows gradient, nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu> sums,
+                             nb::ndarray<uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> marks) {
+    const size_t n = ids.shape(0), k = ids.shape(1), columns = gradient.shape(1), rows = sums.shape(0);
+    if (weights.shape(0) != n || weights.shape(1) != k || gradient.shape(0) != n || sums.shape(1) != columns ||
+        marks.shape(0) != rows)
+        throw nb::value_error("accumulate_rows: shapes do not agree");
+    std::vector<int64_t> touched;
+    for (size_t i = 0; i < n * k; ++i) {
+        const float weight = weights.data()[i];
+        if (weight == 0.0f) continue;  // no neighbour there
+        const size_t row = static_cast<size_t>(ids.data()[i]);
+        if (row >= rows) throw nb::index_error("accumulate_rows: id out of range");
+        if (!marks.data()[row]) touched.push_back(static_cast<int64_t>(row));
+        marks.data()[row] = 1;
+        float* sum = sums.data() + row * columns;
+        const float* g = gradient.data() + i / k * columns;
+        for (size_t c = 0; c < columns; ++c) sum[c] += weight * g[c];
+    }
+    for (const int64_t row : touched) marks.data()[row] = 0;
+    return give(touched);
+}
+
 nb::tuple rasterize(Points points, nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig> T_camera_map, float fx,
                     float fy, float cx, float cy, int width, int height, float radius, float near, float max_half,
                     int k_ray, float layer_gap, float sigma, int threads) {
@@ -122,6 +146,8 @@ NB_MODULE(_native, m) {
             nb::arg("points"))
         .def("knn", &knn, nb::arg("queries"), nb::arg("k"), nb::arg("radius"), nb::arg("threads") = 0);
     m.def("voxel_means", &voxel_means, nb::arg("rows"), nb::arg("cell_size"));
+    m.def("accumulate_rows", &accumulate_rows, nb::arg("ids"), nb::arg("weights"), nb::arg("gradient"),
+          nb::arg("sums").noconvert(), nb::arg("marks").noconvert());
     m.def("rasterize", &rasterize, nb::arg("points"), nb::arg("T_camera_map"), nb::arg("fx"), nb::arg("fy"),
           nb::arg("cx"), nb::arg("cy"), nb::arg("width"), nb::arg("height"), nb::arg("radius"), nb::arg("near"),
           nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"), nb::arg("threads") = 0);
