@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+# Everything runs in .venv, which the first call creates; a ROS installation is not needed.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+PY := $(VENV)/bin/python
+READY := $(VENV)/.scenefactory
+# Python edits take effect at once (scenefactory_dev.pth); only what is compiled or declared needs a new install.
+DECLARED := pyproject.toml CMakeLists.txt $(wildcard sf_*/CMakeLists.txt sf_*/*/CMakeLists.txt sf_*/cmake/*.cmake \
+	sf_*/package.xml sf_interfaces/msg/*.msg sf_interfaces/srv/*.srv sf_interfaces/tf2_msgs/msg/*.msg \
+	sf_recon/csrc/*)
+
+.PHONY: demo test lint bench clean setup
+
+demo: $(READY)
+	$(PY) -m sf_bringup.cli demo
+
+test: lint
+	$(PY) -m pytest -m "not graph and not slow"
+	$(PY) -m pytest -m "graph or slow"
+
+lint: $(READY)
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy
+
+bench: $(READY)
+	@set -e; for script in benchmarks/bench_*.py; do echo "== $$script"; $(PY) "$$script"; done
+
+clean:
+	rm -rf $(VENV) build dist out demo install log .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+setup: $(READY)
+
+$(READY): $(DECLARED)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed: make PYTHON=/path/to/python3.11")'
+	@test -x $(PY) && $(PY) -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV) || \
+		{ rm -rf $(VENV); $(PYTHON) -m pip install -q virtualenv && $(PYTHON) -m virtualenv -q $(VENV); } || \
+		{ echo "no way to create $(VENV): install python3-venv" >&2; exit 1; }
+	$(PY) -m pip install '.[test]'
+	@$(PY) .ci/link_checkout.py
+	@touch $@
