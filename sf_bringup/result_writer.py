@@ -9,7 +9,7 @@ from typing import Any
 
 from sf_interfaces import topics
 from sf_interfaces.io.sequence_writer import SequenceWriter
-from sf_interfaces.types import DepthMap, Float64, Frame, Keyframe, PointCloud, UInt8
+from sf_interfaces.types import DepthMap, Frame, Keyframe, PointCloud, Trajectory, UInt8
 
 
 class ResultWriter:
@@ -75,7 +75,7 @@ class ResultWriter:
         named = PointCloud(cloud.points, cloud.colors, stamp_ns=stamp_ns, frame_id="map")
         self._writer.cloud(topics.SURFACE.name, named)
 
-    def path(self, poses: list[tuple[int, Float64]]) -> None:
+    def path(self, trajectory: Trajectory) -> None:
         """The final path of all frames, once at the end."""
-        if poses:
-            self._writer.path(topics.TRACKING_PATH.name, poses[-1][0], poses, "map")
+        if len(trajectory):
+            self._writer.path(topics.TRACKING_PATH.name, int(trajectory.stamps_ns[-1]), trajectory)

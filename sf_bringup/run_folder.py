@@ -1,4 +1,4 @@
-"""The folder a run leaves behind: what lies where, and how to read it back (ARCHITECTURE of outputs in docs)."""
+"""The folder a run leaves behind: what lies where, and how to read it back."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -16,7 +16,7 @@ from sf_interfaces import topics
 from sf_interfaces.errors import FormatError
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.trajectory import read_tum
-from sf_interfaces.ros.messages import decode_camera_info, decode_depth, to_ns
+from sf_interfaces.ros.messages import decode_camera_info, decode_depth, decode_variance, to_ns
 from sf_interfaces.types import Camera, DepthMap, Trajectory
 
 
@@ -110,7 +110,8 @@ def unpack(run: RunFolder) -> None:
         for raw in reader.messages(wanted):
             message = reader.decode(raw)
             if raw.topic in maps:
-                maps[raw.topic][to_ns(message.header.stamp)] = decode_depth(message).z
+                read = decode_variance if raw.topic == variance_topic else lambda m: decode_depth(m).z
+                maps[raw.topic][to_ns(message.header.stamp)] = read(message)
             elif camera is None:
                 camera, _ = decode_camera_info(message)
     if camera is not None:

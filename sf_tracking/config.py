@@ -1,0 +1,33 @@
+"""Configuration of the tracking block."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sf_interfaces.config import option
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingConfig:
+    """Defaults suit 640x480 to 1242x375 images at 10 to 30 Hz."""
+
+    patches: int = option(240, "patches per keyframe (M)", low=20, high=4000)
+    lifetime: int = option(5, "keyframes whose patches are aligned to a new frame (r)", low=1, high=50)
+    window: int = option(8, "keyframes whose poses are optimised together", low=3, high=100)
+    patch_px: int = option(15, "side of an aligned patch, px", low=5, high=41)
+    levels: int = option(3, "pyramid levels above full resolution once motion is known", low=0, high=6)
+    wide_levels: int = option(5, "pyramid levels while the motion is unknown", low=0, high=8)
+    max_residual: float = option(20.0, "mean grey-level difference above which an edge is rejected", low=1.0)
+    image_sigma: float = option(4.0, "noise of grey levels that scales the confidence of an edge", low=0.1)
+    position_sigma: float = option(0.2, "floor of an edge's standard deviation, px", low=0.001)
+    robust_sigmas: float = option(3.0, "error where the robust kernel sets in, standard deviations", low=0.1)
+    damping: float = option(0.5, "share of the last motion that predicts the next", low=0.0, high=1.0)
+    min_inliers: int = option(25, "edges that a pose has to agree with", low=6)
+    inlier_px: float = option(2.0, "reprojection error of an agreeing edge, px", low=0.1)
+    keyframe_flow: float = option(0.045, "mean flow that makes a keyframe, as part of the image width", low=0.001)
+    keyframe_overlap: float = option(0.6, "share of patches still aligned below which a keyframe is made", high=1.0)
+    depth_gap: float = option(0.08, "relative depth step near a patch above which it is rejected", low=0.0)
+    min_quality: float = option(0.002, "corner quality of a patch relative to the image's best", low=0.0, high=1.0)
+    max_depth: float = option(80.0, "patches farther away are not used, m", low=0.1)
+    seed: int = option(0, "seed of the wide search")

@@ -1,0 +1,3 @@
+"""The tracking algorithm, free of ROS."""
+
+# SPDX-License-Identifier: Apache-2.0
