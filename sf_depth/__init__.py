@@ -1,3 +1,3 @@
-"""Depth: completes what the sensor left out, with the variance of every pixel."""
+"""The depth block."""
 
 # SPDX-License-Identifier: Apache-2.0

@@ -1,3 +1,3 @@
-"""Flexion: an image made of depth alone, for tracking and colouring where no camera image exists."""
+"""The flexion block."""
 
 # SPDX-License-Identifier: Apache-2.0

@@ -1,0 +1,86 @@
+"""The depth node: keyframes with sparse depth in, the same keyframes with dense depth and variance out."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import sys
+from typing import Any, ClassVar
+
+import numpy as np
+
+from sf_depth.config import DepthConfig
+from sf_depth.core.estimator import DepthCompleter
+from sf_interfaces import topics
+from sf_interfaces.ros import messages
+from sf_interfaces.ros.bundles import COMPLETED, publish_bundle
+from sf_interfaces.ros.keyframes import KeyframeSource
+from sf_interfaces.ros.node import BlockNode
+from sf_interfaces.ros.process import run
+from sf_interfaces.types import Keyframe, PointCloud
+
+
+class DepthNode(BlockNode):
+    """Completes the depth (Sec. III-C), mode ``complete``.
+
+    With ``source: sensors`` it is the head of its line and sends the colour of its keyframes too.
+    """
+
+    short: ClassVar[str] = "depth"
+    config_class: ClassVar[type] = DepthConfig
+    defaults: ClassVar[dict[str, Any]] = {"source": "tracking"}
+
+    def setup(self) -> None:
+        """The completer and its keyframes."""
+        self.leader = ""
+        self._completer = DepthCompleter(self.config())
+        self._source = KeyframeSource(self, landmarks=True)
+        self._head = self.options.source == "sensors"
+        self._parts = set(COMPLETED) if self._head else set(COMPLETED) - {"image"}
+        for kind in self._parts:
+            self.output(COMPLETED[kind])
+        self.output(topics.DENSE_POINTS)
+
+    def handle(self, kind: str, msg: Any) -> None:
+        """Complete the keyframes one message makes ready."""
+        for keyframe in self._source.push(kind, msg):
+            self.guarded(lambda keyframe=keyframe: self._complete(keyframe))  # type: ignore[misc]
+
+    def finish(self) -> None:
+        """Complete what was still waiting."""
+        for keyframe in self._source.end():
+            self.guarded(lambda keyframe=keyframe: self._complete(keyframe))  # type: ignore[misc]
+
+    def refresh(self) -> None:
+        """Why input was dropped."""
+        if self.leader:
+            self.health.set_drops(self._source.reasons)
+            self.health.waiting(self._source.waiting_for)
+
+    def _complete(self, keyframe: Keyframe) -> None:
+        dense = self._completer.complete(keyframe)
+        publish_bundle(self, dense, COMPLETED, self._parts)
+        self.health.count("keyframes completed")
+        if self.wanted(topics.DENSE_POINTS):
+            self.output(topics.DENSE_POINTS).publish(
+                messages.encode_cloud(messages.rclpy_factory, _points(dense))
+            )
+        self.sent_one(dense.stamp_ns)
+
+
+def _points(keyframe: Keyframe) -> PointCloud:
+    """The valid pixels as coloured points in the optical frame."""
+    assert keyframe.depth is not None
+    valid, image = keyframe.depth.valid, keyframe.image
+    z = keyframe.depth.z[valid].astype(np.float64)
+    points = keyframe.camera.unproject(keyframe.camera.pixel_grid()[valid], z)
+    colors = image[valid] if image.ndim == 3 else np.repeat(image[valid][:, None], 3, axis=1)
+    return PointCloud(points, colors, stamp_ns=keyframe.stamp_ns, frame_id=keyframe.camera.frame_id)
+
+
+def main() -> int:
+    """Run the node."""
+    return run(DepthNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

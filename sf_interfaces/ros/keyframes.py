@@ -1,0 +1,82 @@
+"""Where a depth or reconstruction node gets its keyframes: a bundle upstream, or posed sensor frames."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+from sf_interfaces.errors import ConfigError
+from sf_interfaces.ros.bundles import COMPLETED, TRACKED, BundleInputs
+from sf_interfaces.ros.node import BlockNode
+from sf_interfaces.ros.sensors import SensorInputs
+from sf_interfaces.types import Frame, Keyframe
+
+
+class KeyframeSource:
+    """Keyframes by the node option ``source``: ``tracking``, ``depth``, or ``sensors`` with given poses.
+
+    Raises:
+        ConfigError: another source.
+    """
+
+    def __init__(self, node: BlockNode, *, landmarks: bool) -> None:
+        self._sensors: SensorInputs | None = None
+        source = node.options.source
+        if source == "sensors":
+            # As the head of its line the node needs the pose from outside.
+            sync = replace(node.sync_config(), pose=True)
+            self._sensors = SensorInputs(sync, lossless=node.options.lossless)
+            for topic, kind, keep in self._sensors.subscriptions():
+                node.listen(topic, kind, keep)
+            node.leader = self._sensors.leader
+            return
+        if source not in ("tracking", "depth"):
+            raise ConfigError(f"source '{source}' is not known; use sensors, tracking or depth")
+        bundle = TRACKED if source == "tracking" else COMPLETED
+        self._bundles = BundleInputs(bundle, set() if landmarks else {"landmarks"})
+        for kind, topic in self._bundles.topics.items():
+            node.listen(topic, kind)
+        node.leader = "image"
+
+    def push(self, kind: str, msg: Any) -> Iterator[Keyframe]:
+        """The keyframes that one message completes.
+
+        Raises:
+            SceneFactoryError: the message is malformed.
+        """
+        if self._sensors is None:
+            keyframe = self._bundles.push(kind, msg)
+            if keyframe is not None:
+                yield keyframe
+            return
+        self._sensors.push(kind, msg)
+        yield from map(_posed, self._sensors.assembler.ready())
+
+    def end(self) -> Iterator[Keyframe]:
+        """The keyframes that were still waiting when the input ended."""
+        if self._sensors is None:
+            self._bundles.joiner.end()
+            return
+        self._sensors.assembler.end()
+        yield from map(_posed, self._sensors.assembler.ready())
+
+    @property
+    def reasons(self) -> dict[str, int]:
+        """Why input was dropped, with counts."""
+        part = self._bundles.joiner if self._sensors is None else self._sensors.assembler
+        return dict(part.reasons)
+
+    @property
+    def waiting_for(self) -> str:
+        """What the oldest image still lacks, in words."""
+        return "" if self._sensors is None else self._sensors.assembler.waiting_for
+
+
+def _posed(frame: Frame) -> Keyframe:
+    """Every frame with a given pose is a keyframe: its pose is final."""
+    assert frame.camera is not None and frame.image is not None and frame.T_map_camera is not None
+    sparse = frame.sparse_depth
+    depth = frame.depth if sparse is None else sparse.to_map(frame.camera.height, frame.camera.width)
+    return Keyframe(frame.stamp_ns, frame.camera, frame.image, frame.T_map_camera, depth)

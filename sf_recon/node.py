@@ -1,0 +1,176 @@
+"""The reconstruction node: keyframes with depth in; the surface, rendered views and the map out."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import open3d as o3d
+from rclpy.task import Future
+
+from sf_interfaces import topics
+from sf_interfaces.errors import FormatError, SceneFactoryError
+from sf_interfaces.ros import messages
+from sf_interfaces.ros.keyframes import KeyframeSource
+from sf_interfaces.ros.node import BlockNode
+from sf_interfaces.ros.process import run
+from sf_interfaces.types import Camera, Keyframe, PointCloud
+from sf_recon.config import ReconConfig
+from sf_recon.core.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True, slots=True)
+class _Request:
+    """A service call on its way to the worker, which alone touches the core."""
+
+    request: Any
+    response: Any
+    done: Future
+
+
+class ReconNode(BlockNode):
+    """Surface, colour and renderer (Sec. III-D)."""
+
+    short: ClassVar[str] = "recon"
+    config_class: ClassVar[type] = ReconConfig
+    defaults: ClassVar[dict[str, Any]] = {"source": "tracking"}
+
+    def __init__(self) -> None:
+        from sf_interfaces.srv import RenderView, SaveMap
+
+        super().__init__()
+        self.service(RenderView, "render_view", self._forward("render"))
+        self.service(SaveMap, "save_map", self._forward("save"))
+
+    def setup(self) -> None:
+        """The reconstruction and its keyframes."""
+        self.leader = ""
+        self._reconstruction = Reconstruction(self.config())
+        self._source = KeyframeSource(self, landmarks=False)
+        self._camera: Camera | None = None
+        self._last_ns = 0
+        self.listen(topics.VIEW_POSE, "view", 1)
+        for topic in (topics.SURFACE, topics.VIEW_IMAGE, topics.VIEW_DEPTH):
+            self.output(topic)
+
+    def handle(self, kind: str, msg: Any) -> None:
+        """Add keyframes; render and save between them."""
+        match kind:
+            case "view":
+                self._view(msg)
+            case "render":
+                self._answer(msg, self._render_service)
+            case "save":
+                self._answer(msg, self._save_service)
+            case _:
+                for keyframe in self._source.push(kind, msg):
+                    self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
+
+    def finish(self) -> None:
+        """Final training, the whole surface, and the files."""
+        for keyframe in self._source.end():
+            self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
+        if self._camera is None:
+            self.health.error("nothing was reconstructed: no keyframe with depth arrived")
+            return
+        self._reconstruction.finish()
+        self._publish_surface(self._reconstruction.surface())
+        if self.out is not None:
+            self._save(self.out)
+
+    def refresh(self) -> None:
+        """Why input was dropped."""
+        if self.leader:
+            self.health.set_drops(self._source.reasons)
+            self.health.waiting(self._source.waiting_for)
+
+    def _add(self, keyframe: Keyframe) -> None:
+        if keyframe.depth is None:
+            self.health.drop("keyframe without any depth")
+            return
+        added = self._reconstruction.add(keyframe)
+        self._camera, self._last_ns = keyframe.camera, keyframe.stamp_ns
+        self.health.count("keyframes")
+        self.health.count("points", len(added))
+        self._publish_surface(added)
+        self.sent_one(keyframe.stamp_ns)
+
+    def _publish_surface(self, cloud: PointCloud) -> None:
+        placed = PointCloud(cloud.points, cloud.colors, stamp_ns=self._last_ns, frame_id="map")
+        self.output(topics.SURFACE).publish(messages.encode_cloud(messages.rclpy_factory, placed))
+
+    def _save(self, folder: Path) -> list[Path]:
+        surface = self._reconstruction.surface()
+        paths = [folder / "map.sfmap", folder / "surface.ply"]
+        self._reconstruction.save(paths[0])
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surface.points.astype("float64")))
+        if surface.colors is not None:
+            cloud.colors = o3d.utility.Vector3dVector(surface.colors / 255.0)
+        if not o3d.io.write_point_cloud(str(paths[1]), cloud):
+            raise FormatError(f"cannot write {paths[1]}; choose a folder that can be written")
+        return paths
+
+    def _view(self, msg: Any) -> None:
+        wanted = [topic for topic in (topics.VIEW_IMAGE, topics.VIEW_DEPTH) if self.wanted(topic)]
+        if self._camera is None or not wanted:
+            return
+        image, depth = self._render(self._camera, msg)
+        for topic, sent in ((topics.VIEW_IMAGE, image), (topics.VIEW_DEPTH, depth)):
+            if topic in wanted:
+                self.output(topic).publish(sent)
+
+    def _render(self, camera: Camera, pose: Any) -> tuple[Any, Any]:
+        stamp_ns, _, T_map_camera = messages.decode_pose(pose)
+        view = self._reconstruction.render(camera, T_map_camera)
+        image = messages.encode_image(messages.rclpy_factory, view.image, stamp_ns, camera.frame_id)
+        return image, messages.encode_depth(messages.rclpy_factory, view.depth, stamp_ns, camera.frame_id)
+
+    # ---- services: the executor hands the call to the worker and awaits it
+
+    def _forward(self, kind: str) -> Any:
+        async def call(request: Any, response: Any) -> Any:
+            if self._worker is None or not self._worker.is_alive():
+                # After the end of the stream the worker is gone and the core is free.
+                job = _Request(request, response, Future())
+                self.handle(kind, job)
+                return response
+            job = _Request(request, response, Future(executor=self.executor))
+            self.enqueue(kind, job)
+            return await job.done
+
+        return call
+
+    def _answer(self, job: _Request, serve: Any) -> None:
+        try:
+            serve(job.request, job.response)
+        finally:
+            job.done.set_result(job.response)
+
+    def _render_service(self, request: Any, response: Any) -> None:
+        if self._camera is not None:
+            camera, _ = messages.decode_camera_info(request.camera_info)
+            response.image, response.depth = self._render(camera, request.pose)
+
+    def _save_service(self, request: Any, response: Any) -> None:
+        if self._camera is None:
+            response.message = "nothing is reconstructed yet; call again after the first keyframe"
+            return
+        try:
+            folder = Path(request.directory)
+            folder.mkdir(parents=True, exist_ok=True)
+            response.paths = [str(path) for path in self._save(folder)]
+            response.success = True
+        except (OSError, SceneFactoryError) as error:
+            response.message = f"cannot save to {request.directory}: {error}"
+
+
+def main() -> int:
+    """Run the node."""
+    return run(ReconNode)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
