@@ -1,0 +1,3 @@
+"""Starts things: planner, orchestrator, player, recorder and the command line."""
+
+# SPDX-License-Identifier: Apache-2.0
