@@ -1,3 +1,3 @@
-"""What starts things: command line, planner, player, recorder, demos."""
+"""Starts things: planner, orchestrator, player, recorder and the command line."""
 
 # SPDX-License-Identifier: Apache-2.0
