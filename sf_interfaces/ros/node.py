@@ -53,7 +53,7 @@ def stamp_of(raw: bytes) -> int:
 
 
 class BlockNode(LifecycleNode):
-    """Base of all nodes. A block fills in :meth:`setup`, :meth:`handle` and :meth:`finish`.
+    """Base of all nodes. A block fills in :meth:`setup`, :meth:`take` and :meth:`finish`.
 
     Attributes:
         short: name of the node below /sf, and of its topics.
@@ -93,7 +93,7 @@ class BlockNode(LifecycleNode):
         """Build the core and declare inputs with :meth:`listen` (executor thread, on configure)."""
         raise NotImplementedError
 
-    def handle(self, kind: str, msg: Any) -> None:
+    def take(self, kind: str, msg: Any) -> None:
         """Take one decoded message (worker thread)."""
         raise NotImplementedError
 
@@ -307,10 +307,10 @@ class BlockNode(LifecycleNode):
 
     def _handle_raw(self, kind: str, data: Any) -> None:
         if kind not in self._types:
-            self.handle(kind, data)
+            self.take(kind, data)
             return
         try:
-            self.handle(kind, deserialize_message(data, self._types[kind]))
+            self.take(kind, deserialize_message(data, self._types[kind]))
         finally:
             if kind == self.leader:
                 self._credit(stamp_of(data))
