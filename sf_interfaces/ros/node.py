@@ -128,7 +128,10 @@ class BlockNode(LifecycleNode):
     def output(self, topic: Topic) -> Publisher:
         """The publisher of a topic, made on the first call."""
         if topic not in self._outputs:
-            cls, qos = messages.rclpy_factory(topic.type), qos_profile(topic.qos, lossless=self.options.lossless)
+            cls, qos = (
+                messages.rclpy_factory(topic.type),
+                qos_profile(topic.qos, lossless=self.options.lossless),
+            )
             self._outputs[topic] = self.create_publisher(cls, topic.name, qos)
         return self._outputs[topic]
 
@@ -274,7 +277,9 @@ class BlockNode(LifecycleNode):
                 self.health.drop(f"{self.leader} announced by upstream but never received", lost)
                 self._end_input()
         self.health.value("queue", len(self._inbox))
-        self.health.value("stream", "finished" if self._finished else "running" if self._active else "inactive")
+        self.health.value(
+            "stream", "finished" if self._finished else "running" if self._active else "inactive"
+        )
         self.refresh()
 
     # ---- worker thread
@@ -317,7 +322,9 @@ class BlockNode(LifecycleNode):
 
     def _credit(self, stamp_ns: int) -> None:
         if self.options.source == "sensors":
-            self.output(topics.consumed(self.short)).publish(messages.to_stamp(messages.rclpy_factory, stamp_ns))
+            self.output(topics.consumed(self.short)).publish(
+                messages.to_stamp(messages.rclpy_factory, stamp_ns)
+            )
 
     def _publish_state(self, state: int, stamp_ns: int) -> None:
         topic = topics.stream(self.short)
