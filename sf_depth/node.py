@@ -40,7 +40,7 @@ class DepthNode(BlockNode):
             self.output(COMPLETED[kind])
         self.output(topics.DENSE_POINTS)
 
-    def handle(self, kind: str, msg: Any) -> None:
+    def take(self, kind: str, msg: Any) -> None:
         """Complete the keyframes one message makes ready."""
         for keyframe in self._source.push(kind, msg):
             self.guarded(lambda keyframe=keyframe: self._complete(keyframe))  # type: ignore[misc]

@@ -32,7 +32,7 @@ class FlexionNode(BlockNode):
             self.listen(topic, kind, keep)
         self.output(topics.FLEXION_IMAGE)
 
-    def handle(self, kind: str, msg: Any) -> None:
+    def take(self, kind: str, msg: Any) -> None:
         """Convert every depth image whose calibration is known."""
         self._inputs.push(kind, msg)
         self._convert()

@@ -345,7 +345,8 @@ class FrameAssembler:
             found = self.transforms.lookup(self.config.pose_frame, camera_frame, static_only=True)
             if found is None:
                 raise CalibrationError(
-                    f"no transform from '{camera_frame}' to '{self.config.pose_frame}'; publish it on /tf_static"
+                    f"no transform from '{camera_frame}' to '{self.config.pose_frame}': "
+                    "publish it on /tf_static"
                 )
             T_child_camera = found
         if t0 == t1:
@@ -403,5 +404,3 @@ class FrameAssembler:
 def _twist_between(t0_ns: int, T0: Float64, t1_ns: int, T1: Float64) -> Float64:
     """Constant twist [6] (m/s, rad/s) in the moving frame that carries T0 into T1."""
     return se3.log(se3.inverse(T0) @ T1) / ((t1_ns - t0_ns) / _S)
-
-

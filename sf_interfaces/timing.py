@@ -34,6 +34,10 @@ class Timings:
     def to_dict(self) -> dict[str, dict[str, float]]:
         """Ready for timing.json: stage -> seconds, calls, mean_ms."""
         return {
-            stage: {"seconds": self.seconds[stage], "calls": self.calls[stage], "mean_ms": self.mean_ms(stage)}
+            stage: {
+                "seconds": self.seconds[stage],
+                "calls": self.calls[stage],
+                "mean_ms": self.mean_ms(stage),
+            }
             for stage in self.seconds
         }

@@ -56,7 +56,7 @@ class ReconNode(BlockNode):
         for topic in (topics.SURFACE, topics.VIEW_IMAGE, topics.VIEW_DEPTH):
             self.output(topic)
 
-    def handle(self, kind: str, msg: Any) -> None:
+    def take(self, kind: str, msg: Any) -> None:
         """Add keyframes; render and save between them."""
         match kind:
             case "view":
@@ -135,7 +135,7 @@ class ReconNode(BlockNode):
             if self._worker is None or not self._worker.is_alive():
                 # After the end of the stream the worker is gone and the core is free.
                 job = _Request(request, response, Future())
-                self.handle(kind, job)
+                self.take(kind, job)
                 return response
             job = _Request(request, response, Future(executor=self.executor))
             self.enqueue(kind, job)

@@ -49,7 +49,7 @@ class TrackingNode(BlockNode):
         self._path_stamp_ns: int | None = None
         self._epoch = self._inputs.assembler.epoch
 
-    def handle(self, kind: str, msg: Any) -> None:
+    def take(self, kind: str, msg: Any) -> None:
         """Push one message and track the frames it completes."""
         self._inputs.push(kind, msg)
         self._advance()

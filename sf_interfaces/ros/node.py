@@ -53,7 +53,7 @@ def stamp_of(raw: bytes) -> int:
 
 
 class BlockNode(LifecycleNode):
-    """Base of all nodes. A block fills in :meth:`setup`, :meth:`handle` and :meth:`finish`.
+    """Base of all nodes. A block fills in :meth:`setup`, :meth:`take` and :meth:`finish`.
 
     Attributes:
         short: name of the node below /sf, and of its topics.
@@ -93,7 +93,7 @@ class BlockNode(LifecycleNode):
         """Build the core and declare inputs with :meth:`listen` (executor thread, on configure)."""
         raise NotImplementedError
 
-    def handle(self, kind: str, msg: Any) -> None:
+    def take(self, kind: str, msg: Any) -> None:
         """Take one decoded message (worker thread)."""
         raise NotImplementedError
 
@@ -128,7 +128,10 @@ class BlockNode(LifecycleNode):
     def output(self, topic: Topic) -> Publisher:
         """The publisher of a topic, made on the first call."""
         if topic not in self._outputs:
-            cls, qos = messages.rclpy_factory(topic.type), qos_profile(topic.qos, lossless=self.options.lossless)
+            cls, qos = (
+                messages.rclpy_factory(topic.type),
+                qos_profile(topic.qos, lossless=self.options.lossless),
+            )
             self._outputs[topic] = self.create_publisher(cls, topic.name, qos)
         return self._outputs[topic]
 
@@ -274,7 +277,9 @@ class BlockNode(LifecycleNode):
                 self.health.drop(f"{self.leader} announced by upstream but never received", lost)
                 self._end_input()
         self.health.value("queue", len(self._inbox))
-        self.health.value("stream", "finished" if self._finished else "running" if self._active else "inactive")
+        self.health.value(
+            "stream", "finished" if self._finished else "running" if self._active else "inactive"
+        )
         self.refresh()
 
     # ---- worker thread
@@ -307,17 +312,19 @@ class BlockNode(LifecycleNode):
 
     def _handle_raw(self, kind: str, data: Any) -> None:
         if kind not in self._types:
-            self.handle(kind, data)
+            self.take(kind, data)
             return
         try:
-            self.handle(kind, deserialize_message(data, self._types[kind]))
+            self.take(kind, deserialize_message(data, self._types[kind]))
         finally:
             if kind == self.leader:
                 self._credit(stamp_of(data))
 
     def _credit(self, stamp_ns: int) -> None:
         if self.options.source == "sensors":
-            self.output(topics.consumed(self.short)).publish(messages.to_stamp(messages.rclpy_factory, stamp_ns))
+            self.output(topics.consumed(self.short)).publish(
+                messages.to_stamp(messages.rclpy_factory, stamp_ns)
+            )
 
     def _publish_state(self, state: int, stamp_ns: int) -> None:
         topic = topics.stream(self.short)

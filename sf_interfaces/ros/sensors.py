@@ -11,7 +11,6 @@ from sf_interfaces import topics
 from sf_interfaces.ros import messages
 from sf_interfaces.sync import FrameAssembler, SyncConfig
 from sf_interfaces.topics import Topic
-from sf_interfaces.types import Frame
 
 _LIVE_WAIT_S = 0.3  # stream time a live image waits for its companions
 _KEEP = {"image": 2, "depth": 4, "lidar": 3, "pose": 400}  # live: messages held, latest wins
@@ -61,9 +60,13 @@ class SensorInputs:
         a = self.assembler
         match kind:
             case "image":
-                a.push_image(messages.to_ns(msg.header.stamp), messages.decode_image(msg), msg.header.frame_id)
+                a.push_image(
+                    messages.to_ns(msg.header.stamp), messages.decode_image(msg), msg.header.frame_id
+                )
             case "depth":
-                a.push_depth(messages.to_ns(msg.header.stamp), messages.decode_depth(msg), msg.header.frame_id)
+                a.push_depth(
+                    messages.to_ns(msg.header.stamp), messages.decode_depth(msg), msg.header.frame_id
+                )
             case "lidar":
                 a.push_cloud(messages.decode_cloud(msg))
             case "pose":

@@ -89,7 +89,9 @@ def _case(draw: st.DrawFn) -> tuple[SyncConfig, list, list]:
         return out + [s * MS for s in stamps] if jump else out
 
     jump = draw(st.booleans())
-    stamps = {name: times(0 if name != "image" else 1, 8, jump) for name in ("image", "depth", "lidar", "pose")}
+    stamps = {
+        name: times(0 if name != "image" else 1, 8, jump) for name in ("image", "depth", "lidar", "pose")
+    }
     config = SyncConfig(
         depth=draw(st.booleans()), lidar=draw(st.booleans()), pose=draw(st.booleans()), depth_slop_s=0.03
     )
@@ -190,7 +192,13 @@ def test_bad_messages_are_dropped_with_a_reason() -> None:
     assembler.end()
     assert [f.stamp_ns for f in assembler.ready()] == [50]
     reasons = " | ".join(assembler.reasons)
-    for words in ("no finite point", "not newer", "image is 10x10", "no depth input", "without a lidar sweep"):
+    for words in (
+        "no finite point",
+        "not newer",
+        "image is 10x10",
+        "no depth input",
+        "without a lidar sweep",
+    ):
         assert words in reasons
 
 
