@@ -74,7 +74,7 @@ def _convert(args: argparse.Namespace) -> int:
 
 
 def _simulate(args: argparse.Namespace) -> int:
-    from sf_bringup.simulate.command import simulate_command
+    from sf_bringup.simulate_command import simulate_command
 
     return simulate_command(args)
 
@@ -210,7 +210,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("out", type=Path)
 
     p = verb("simulate", _simulate, "write a bag with exact ground truth from a procedural scene")
-    from sf_bringup.simulate.command import add_arguments
+    from sf_bringup.simulate_command import add_arguments
 
     add_arguments(p)
 

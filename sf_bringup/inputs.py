@@ -10,20 +10,11 @@ import yaml
 
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.io.bag import BagReader
+from sf_interfaces.io.bag import BagReader, is_bag
 from sf_interfaces.io.datasets import recognise
-from sf_interfaces.io.mcap_writer import McapWriter
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.types import Camera, Float64, check_pose
-
-_BAG_SUFFIXES = (".mcap", ".db3", ".bag")
-
-
-def is_bag(path: Path) -> bool:
-    """A bag file, or a folder that rosbag2 wrote."""
-    return path.suffix in _BAG_SUFFIXES or (path / "metadata.yaml").is_file()
-
 
 def convert(dataset: Path, out: Path) -> dict[str, int]:
     """Write a data set folder as one mcap bag; returns messages per topic.
@@ -122,7 +113,7 @@ def with_given(
     info_topic = image_topic.rsplit("/", 1)[0] + "/camera_info"
     with BagReader(bag) as reader, SequenceWriter(target) as writer:
         if extrinsic is not None:
-            writer.tf_static(*extrinsic)
+            writer.tf_static(*extrinsic, stamp_ns=reader.start_ns)
         if poses is not None:
             given = read_tum(poses)
             for stamp, T in zip(given.stamps_ns.tolist(), given.poses, strict=True):
@@ -130,7 +121,7 @@ def with_given(
         for raw in reader.messages():
             if camera is not None and raw.topic == info_topic:
                 continue
-            _copy(writer, raw)
+            writer.bag.write(raw.topic, raw.type, raw.stamp_ns, raw.data)
             if camera is not None and raw.topic == image_topic:
                 writer.camera_info(info_topic, raw.stamp_ns, camera)
     return target

@@ -12,10 +12,22 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+from sf_bringup.planner import Plan
+from sf_bringup.preflight import BagInput
+from sf_bringup.progress import Progress
 from sf_bringup.result_writer import ResultWriter
-from sf_interfaces.config import ConfigFile
+from sf_bringup.run_folder import RunFolder
+from sf_bringup.wiring import sync_values
+from sf_interfaces.blocks import BlockSpec
+from sf_interfaces.config import ConfigFile, build
 from sf_interfaces.errors import ConfigError
-from sf_interfaces.types import Frame, Keyframe
+from sf_interfaces.io.bag import BagReader
+from sf_interfaces.io.cloud import write_surface
+from sf_interfaces.io.sequence_writer import SequenceWriter
+from sf_interfaces.io.trajectory import write_tum
+from sf_interfaces.ros.sensors import SensorInputs
+from sf_interfaces.sync import SyncConfig
+from sf_interfaces.types import Float64, Frame, Keyframe, Scale, Trajectory
 
 PARTS_GROUP = "scenefactory.parts"
 
@@ -52,9 +64,14 @@ class ProductionLine:
         self._completer = parts.get("depth:complete")
         self.reconstruction = parts.get("recon")
         self._writer = writer
+        self.keyframe_poses: list[tuple[int, Float64]] = []
 
-    def step(self, frame: Frame) -> None:
-        """Take one frame through the line; everything it completes goes to the writer."""
+    def step(self, frame: Frame) -> Float64 | None:
+        """Take one frame through the line; everything it completes goes to the writer.
+
+        Returns:
+            The metric pose just tracked, from which the motion during the next sweep is predicted.
+        """
         if self._flexion is not None and frame.image is None:
             image = self._flexion(frame.depth, frame.camera)
             self._writer.flexion(frame, image)
@@ -63,12 +80,14 @@ class ProductionLine:
             update = self.tracker.track(frame)
             self._writer.tracked(frame, update)
             self._finish_keyframes(update.keyframes)
-        elif frame.T_map_camera is not None and frame.image is not None and frame.camera is not None:
+            return update.T_map_camera if update.scale is Scale.METRIC else None
+        if frame.T_map_camera is not None and frame.image is not None and frame.camera is not None:
             sparse = frame.sparse_depth
             depth = frame.depth if sparse is None else sparse.to_map(frame.camera.height, frame.camera.width)
             keyframe = Keyframe(frame.stamp_ns, frame.camera, frame.image, frame.T_map_camera, depth)
             self._writer.keyframe(keyframe)
             self._complete(keyframe)
+        return None
 
     def finish(self) -> None:
         """End of the input: the tracker's window becomes final, the colour field gets its last sweeps."""
@@ -79,6 +98,7 @@ class ProductionLine:
 
     def _finish_keyframes(self, keyframes: Sequence[Keyframe]) -> None:
         for keyframe in keyframes:
+            self.keyframe_poses.append((keyframe.stamp_ns, keyframe.T_map_camera))
             self._writer.keyframe(keyframe)
             self._complete(keyframe)
 
@@ -88,3 +108,69 @@ class ProductionLine:
             self._writer.dense(keyframe)
         if self.reconstruction is not None:
             self._writer.surface(keyframe.stamp_ns, self.reconstruction.add(keyframe))
+
+
+def run_inproc(
+    folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float
+) -> dict[str, int]:
+    """Take a bag through the line in this process and record the same topics the graph would.
+
+    Args:
+        rate: only the graph plays live; must be 0 here.
+
+    Returns:
+        Why input was dropped, with counts.
+
+    Raises:
+        ConfigError: a rate was given.
+    """
+    if rate:
+        raise ConfigError("--rate plays live through the graph; add --engine ros")
+    roles = given.mapping.roles
+    head = replace(made.steps[0], spec=_head_spec(made))
+    values = {**sync_values(made, roles, head), **config.sections.get("sync", {})}
+    values["image"] = "rgb" in roles
+    inputs = SensorInputs(build(SyncConfig, values, "section 'sync'"), lossless=True)
+    kinds = {topic: _KIND[role] for role, topic in roles.items()} | {"/tf": "tf", "/tf_static": "tf_static"}
+    with (
+        BagReader(given.bag) as reader,
+        ResultWriter(SequenceWriter(folder.result)) as writer,
+        Progress("running", "frames") as progress,
+    ):
+        line = ProductionLine(made.ids, config, writer)
+        done = 0
+        for raw in reader.messages([t for t in kinds if t in reader.topics]):
+            inputs.push(kinds[raw.topic], reader.decode(raw))
+            for frame in inputs.assembler.ready():
+                inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
+                done += 1
+            progress.update(done, given.leading_messages)
+        inputs.assembler.end()
+        for frame in inputs.assembler.ready():
+            inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
+        line.finish()
+        _save(folder, line, writer)
+    return dict(inputs.assembler.reasons)
+
+
+_KIND = {"rgb": "image", "camera_info": "camera_info", "depth": "depth", "lidar": "lidar", "pose": "pose"}
+
+
+def _head_spec(made: Plan) -> BlockSpec:
+    """What all blocks together take from the sensors: in one process there is one head."""
+    first = made.steps[0].spec
+    requires = frozenset().union(*(step.spec.requires for step in made.steps))
+    optional = frozenset().union(*(step.spec.optional for step in made.steps))
+    return replace(first, requires=requires, optional=optional)
+
+
+def _save(folder: RunFolder, line: ProductionLine, writer: ResultWriter) -> None:
+    """The files that the nodes of the graph write at their end."""
+    if line.tracker is not None:
+        trajectory = line.tracker.trajectory()
+        write_tum(folder.path / "trajectory.tum", trajectory)
+        write_tum(folder.path / "keyframes.tum", Trajectory.from_pairs(line.keyframe_poses, trajectory.scale))
+        writer.path(trajectory)
+    if line.reconstruction is not None:
+        line.reconstruction.save(folder.map)
+        write_surface(folder.path / "surface.ply", line.reconstruction.surface())

@@ -27,6 +27,7 @@ class BagInput:
     frames: Mapping[str, str]  # role -> frame_id of its first message
     static: FrameTree
     seconds: float
+    leading_messages: int  # images, or depth images where there are none: the frames of the run
 
 
 def _first(reader: BagReader, topic: str) -> RawMessage | None:
@@ -74,7 +75,10 @@ def inspect(bag: Path, user: Mapping[str, str]) -> BagInput:
             raw = _first(reader, topic)
             if raw is not None:
                 frames[role] = reader.decode(raw).header.frame_id.lstrip("/")
-        return BagInput(bag, mapping, frames, _static_frames(reader), (reader.end_ns - reader.start_ns) * 1e-9)
+        leader = mapping.roles.get("rgb") or mapping.roles.get("depth", "")
+        count = reader.topics[leader].count if leader else 0
+        seconds = (reader.end_ns - reader.start_ns) * 1e-9
+        return BagInput(bag, mapping, frames, _static_frames(reader), seconds, count)
 
 
 def check_extrinsic(given: BagInput) -> None:

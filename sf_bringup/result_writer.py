@@ -9,7 +9,7 @@ from typing import Any
 
 from sf_interfaces import topics
 from sf_interfaces.io.sequence_writer import SequenceWriter
-from sf_interfaces.types import DepthMap, Frame, Keyframe, PointCloud, Trajectory, UInt8
+from sf_interfaces.types import Frame, Keyframe, PointCloud, Trajectory, UInt8
 
 
 class ResultWriter:
@@ -64,9 +64,9 @@ class ResultWriter:
         stamp, frame_id, depth = keyframe.stamp_ns, keyframe.camera.frame_id, keyframe.depth
         assert depth is not None
         w = self._writer
-        w.depth(topics.DENSE_IMAGE.name, stamp, DepthMap(depth.z), frame_id, "32FC1")
+        w.depth(topics.DENSE_IMAGE.name, stamp, depth, frame_id, "32FC1")
         if depth.variance is not None:
-            w.depth(topics.DENSE_VARIANCE.name, stamp, DepthMap(depth.variance), frame_id, "32FC1")
+            w.variance(topics.DENSE_VARIANCE.name, stamp, depth, frame_id)
         w.camera_info(topics.DENSE_INFO.name, stamp, keyframe.camera)
         w.pose(topics.DENSE_POSE.name, stamp, keyframe.T_map_camera, "map")
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import open3d as o3d
 from rclpy.task import Future
 
 from sf_interfaces import topics
-from sf_interfaces.errors import FormatError, SceneFactoryError
+from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.io.cloud import write_surface
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
@@ -106,11 +106,7 @@ class ReconNode(BlockNode):
         surface = self._reconstruction.surface()
         paths = [folder / "map.sfmap", folder / "surface.ply"]
         self._reconstruction.save(paths[0])
-        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(surface.points.astype("float64")))
-        if surface.colors is not None:
-            cloud.colors = o3d.utility.Vector3dVector(surface.colors / 255.0)
-        if not o3d.io.write_point_cloud(str(paths[1]), cloud):
-            raise FormatError(f"cannot write {paths[1]}; choose a folder that can be written")
+        write_surface(paths[1], surface)
         return paths
 
     def _view(self, msg: Any) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sf_interfaces.io.definitions import typestore
 from sf_interfaces.io.mcap_writer import McapWriter
 from sf_interfaces.ros import messages
-from sf_interfaces.types import Camera, DepthMap, Float64, PointCloud, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float64, PointCloud, Trajectory, UInt8
 
 _IMAGE, _INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 
@@ -53,6 +53,14 @@ class SequenceWriter:
         """Depth as 16UC1 (mm) or 32FC1 (m)."""
         msg = messages.encode_depth(self._make, depth, stamp_ns, frame_id, encoding)
         self._write(topic, _IMAGE, stamp_ns, msg)
+
+    def variance(self, topic: str, stamp_ns: int, depth: DepthMap, frame_id: str) -> None:
+        """The variance of a depth map as 32FC1 (m^2)."""
+        self._write(topic, _IMAGE, stamp_ns, messages.encode_variance(self._make, depth, stamp_ns, frame_id))
+
+    def path(self, topic: str, stamp_ns: int, trajectory: Trajectory) -> None:
+        """All poses of a trajectory as nav_msgs/Path."""
+        self._write(topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns))
 
     def camera_info(self, topic: str, stamp_ns: int, camera: Camera) -> None:
         """Intrinsics, in the camera's frame."""

@@ -1,0 +1,151 @@
+"""A production line as processes: brought up in order, watched, restarted, changed by difference, stopped."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.node import Node
+
+from sf_bringup.launcher import Process, node_command, stop_all
+from sf_bringup.wiring import NodeLaunch
+from sf_interfaces.errors import ConfigError, SceneFactoryError
+
+_START_S = 60.0  # importing torch on a busy machine takes a while
+_TRANSITION_S = 30.0
+_BACK_OFF_S = (1.0, 2.0, 4.0)  # before each of the at most three restarts
+
+
+@dataclass(slots=True)
+class _Running:
+    launch: NodeLaunch
+    process: Process
+    restarts: int = 0
+    restart_at: float | None = None
+
+
+class Line:
+    """The nodes of one plan under one parent.
+
+    Args:
+        node: the parent's node, for lifecycle services; the caller does not spin it meanwhile.
+        folder: where logs and parameter files go.
+        environment: of the children.
+    """
+
+    def __init__(self, node: Node, folder: Path, environment: Mapping[str, str]) -> None:
+        self._node, self._folder, self._environment = node, folder, environment
+        self._running: dict[str, _Running] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Short names of the nodes, in the order of the plan."""
+        return tuple(self._running)
+
+    @property
+    def processes(self) -> list[Process]:
+        """All children."""
+        return [r.process for r in self._running.values()]
+
+    def apply(self, wanted: Iterable[NodeLaunch]) -> tuple[list[str], list[str]]:
+        """Start what is new, stop what is no longer wanted; nodes that stay the same keep running.
+
+        Returns:
+            Names of started and of stopped nodes.
+
+        Raises:
+            SceneFactoryError: a new node did not come up.
+        """
+        plan = {launch.name: launch for launch in wanted}
+        stopped = [n for n, r in self._running.items() if plan.get(n) != r.launch]
+        stop_all([self._running.pop(n).process for n in stopped])
+        started = [n for n in plan if n not in self._running]
+        for name in started:
+            self._running[name] = _Running(plan[name], self._spawn(plan[name]))
+        self._running = {n: self._running[n] for n in plan}
+        # Consumers first: when a head becomes active, everybody downstream already listens.
+        for name in reversed(started):
+            self.bring_up(name)
+        return started, stopped
+
+    def bring_up(self, name: str) -> None:
+        """Configure and activate one node.
+
+        Raises:
+            ConfigError: the node refused; the sentence is the node's own.
+            SceneFactoryError: it died or did not answer in time.
+        """
+        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+            request = ChangeState.Request(transition=Transition(id=transition))
+            answer = self._call(name, "change_state", ChangeState, request)
+            if not answer.success:
+                raise ConfigError(f"node {name} refused to start: {self._running[name].process.last_lines(3)}")
+
+    def is_active(self, name: str) -> bool:
+        """Whether the node answers and is in its active state."""
+        state = self._call(name, "get_state", GetState, GetState.Request()).current_state
+        return bool(state.id == State.PRIMARY_STATE_ACTIVE)
+
+    def dead(self) -> dict[str, int]:
+        """Exit codes of nodes that ended."""
+        return {n: code for n, r in self._running.items() if (code := r.process.poll()) is not None}
+
+    def supervise(self, now: float) -> list[str]:
+        """Restart nodes that died, with growing pauses and at most three times each; returns what was done.
+
+        Raises:
+            SceneFactoryError: a node keeps dying.
+        """
+        said = []
+        for name, code in self.dead().items():
+            running = self._running[name]
+            if running.restarts >= len(_BACK_OFF_S):
+                raise SceneFactoryError(
+                    f"node {name} died {running.restarts + 1} times, last with exit code {code}; "
+                    f"see {running.process.log}"
+                )
+            if running.restart_at is None:
+                running.restart_at = now + _BACK_OFF_S[running.restarts]
+                said.append(f"node {name} died with exit code {code}, restart in {_BACK_OFF_S[running.restarts]:g} s")
+            elif now >= running.restart_at:
+                running.restarts, running.restart_at = running.restarts + 1, None
+                running.process = self._spawn(running.launch)
+                self.bring_up(name)
+                said.append(f"node {name} restarted")
+        return said
+
+    def stop(self) -> None:
+        """End all nodes; they are gone when this returns."""
+        stop_all(self.processes)
+        self._running.clear()
+
+    def _spawn(self, launch: NodeLaunch) -> Process:
+        log = self._folder / f"{launch.name}.log"
+        return Process(launch.name, node_command(launch, self._folder), log, self._environment)
+
+    def _call(self, name: str, service: str, kind: Any, request: Any) -> Any:
+        client = self._node.create_client(kind, f"/sf/{name}/{service}")
+        process = self._running[name].process
+        try:
+            deadline = time.monotonic() + _START_S
+            while not client.wait_for_service(timeout_sec=0.2):
+                if process.poll() is not None:
+                    raise ConfigError(
+                        f"node {name} ended with exit code {process.poll()} while starting: {process.last_lines(3)}"
+                    )
+                if time.monotonic() > deadline:
+                    raise SceneFactoryError(f"node {name} did not start within {_START_S:g} s; see {process.log}")
+            future = client.call_async(request)
+            rclpy.spin_until_future_complete(self._node, future, timeout_sec=_TRANSITION_S)
+            if not future.done():
+                raise SceneFactoryError(f"node {name} does not answer {service}; see {process.log}")
+            return future.result()
+        finally:
+            self._node.destroy_client(client)

@@ -1,0 +1,25 @@
+"""Point cloud files."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+
+from sf_interfaces.errors import FormatError
+from sf_interfaces.types import PointCloud
+
+
+def write_surface(path: Path, cloud: PointCloud) -> None:
+    """Write points with colour as PLY.
+
+    Raises:
+        FormatError: the file cannot be written.
+    """
+    out = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points.astype(np.float64)))
+    if cloud.colors is not None:
+        out.colors = o3d.utility.Vector3dVector(cloud.colors / 255.0)
+    if not o3d.io.write_point_cloud(str(path), out):
+        raise FormatError(f"cannot write {path}; choose a folder that can be written")
