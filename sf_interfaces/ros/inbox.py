@@ -1,4 +1,4 @@
-"""Between the thread that receives and the one that works: the queue, and the joining of keyframe bundles. Pure."""
+"""Between the thread that receives and the one that works: the queue, and the joining of bundles. Pure."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations

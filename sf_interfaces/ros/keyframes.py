@@ -38,7 +38,7 @@ class KeyframeSource:
         self._bundles = BundleInputs(bundle, set() if landmarks else {"landmarks"})
         for kind, topic in self._bundles.topics.items():
             node.listen(topic, kind)
-        node.leader = "image"
+        node.leader, node.counted = "image", set(self._bundles.topics)
 
     def push(self, kind: str, msg: Any) -> Iterator[Keyframe]:
         """The keyframes that one message completes.

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +60,8 @@ class BlockNode(LifecycleNode):
         short: name of the node below /sf, and of its topics.
         config_class: configuration dataclass of the block.
         defaults: node options that differ for this block.
-        leader: kind of message that is counted against the upstream's total, set in :meth:`setup`.
+        leader: kind of message whose consumption is credited and whose number the upstream announces.
+        counted: further kinds of which the upstream announces the same number (the parts of a bundle).
     """
 
     short: ClassVar[str]
@@ -70,6 +72,7 @@ class BlockNode(LifecycleNode):
         super().__init__(self.short, namespace="sf")
         self.health = Health()
         self.leader = ""
+        self.counted: set[str] = set()
         self.exit_code: int | None = None
         self._subscriptions_wanted: list[tuple[Topic, str, int | None]] = []
         self._active: list[tuple[Subscription, Callable[[bytes], None]]] = []
@@ -77,7 +80,8 @@ class BlockNode(LifecycleNode):
         self._outputs: dict[Topic, Publisher] = {}
         self._inbox = Inbox(self._dropped)
         self._worker: threading.Thread | None = None
-        self._received = self._sent = self._stalled = 0
+        self._received: Counter[str] = Counter()
+        self._sent = self._stalled = 0
         self._announced: int | None = None
         self._ended = self._finished = False
         parameters.declare(self, NodeOptions, defaults=self.defaults)
@@ -169,7 +173,8 @@ class BlockNode(LifecycleNode):
         """Subscribe and start the worker."""
         lossless = self.options.lossless
         self._inbox = Inbox(self._dropped)
-        self._received = self._sent = self._stalled = 0
+        self._received.clear()
+        self._sent = self._stalled = 0
         self._announced, self._ended, self._finished = None, False, False
         self._worker = threading.Thread(target=self._work, name=f"{self.short}-worker", daemon=True)
         self._worker.start()
@@ -225,10 +230,9 @@ class BlockNode(LifecycleNode):
         def take(raw: bytes) -> None:
             self._inbox.put(kind, raw, keep)
             self.health.count(f"{kind} received")
-            if kind == self.leader:
-                self._received += 1
-                self._stalled = 0
-                self._end_if_complete()
+            self._received[kind] += 1
+            self._stalled = 0
+            self._end_if_complete()
 
         return take
 
@@ -254,8 +258,11 @@ class BlockNode(LifecycleNode):
     def _end_if_complete(self) -> None:
         if self._announced is None or self._ended:
             return
-        if self._received >= self._announced or (not self.options.lossless and self._stalled):
+        if self._least_received() >= self._announced:
             self._end_input()
+
+    def _least_received(self) -> int:
+        return min((self._received[kind] for kind in self.counted | {self.leader}), default=0)
 
     def _end_input(self) -> None:
         if not self._ended:
@@ -272,7 +279,7 @@ class BlockNode(LifecycleNode):
     def _refresh(self) -> None:
         if self._announced is not None and not self._ended:
             self._stalled += 1
-            lost = self._announced - self._received
+            lost = self._announced - self._least_received()
             if self._stalled >= _STALL_REPORTS or not self.options.lossless:
                 self.health.drop(f"{self.leader} announced by upstream but never received", lost)
                 self._end_input()
