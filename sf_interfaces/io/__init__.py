@@ -1,0 +1,3 @@
+"""Files: bags, data sets and trajectories."""
+
+# SPDX-License-Identifier: Apache-2.0
