@@ -1,3 +1,3 @@
-"""Starts things: planner, orchestrator, player, recorder and the command line."""
+"""What starts things: command line, planner, player, recorder, demos."""
 
 # SPDX-License-Identifier: Apache-2.0

@@ -1,0 +1,131 @@
+"""Writes a simulated recording with its exact ground truth as a bag."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sf_bringup.simulate.render import Renderer
+from sf_bringup.simulate.scenes import SCENES
+from sf_bringup.simulate.sensors import LIDARS, SWEEP_PHASE, lidar_sweep, structured_light, time_of_flight
+from sf_bringup.simulate.spec import SimulationSpec
+from sf_bringup.simulate.trajectories import CameraPath, oval
+from sf_interfaces.errors import ConfigError
+from sf_interfaces.geometry import se3
+from sf_interfaces.io.sequence_writer import SequenceWriter
+from sf_interfaces.types import DepthMap, Float32, Float64, PointCloud
+
+START_NS = 1_000_000_000_000
+OPTICAL, LIDAR = "camera_optical_frame", "lidar"
+T_BASE_CAMERA_LINK = se3.exp(np.array([0.05, 0.0, 0.0, 0, 0, 0]))
+T_BASE_LIDAR = se3.exp(np.array([0.0, 0.02, 0.09, 0, 0, 0]))
+T_LINK_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+T_CAMERA_LIDAR = se3.inverse(T_BASE_CAMERA_LINK @ T_LINK_OPTICAL) @ T_BASE_LIDAR
+
+
+@dataclass(frozen=True)
+class SimulationSummary:
+    """What was written and how long it took."""
+
+    path: Path
+    frames: int
+    sweeps: int
+    duration_s: float
+    wall_s: float
+
+
+class Simulator:
+    """The scene, path and sensors of one specification; arrays out, no files."""
+
+    def __init__(self, spec: SimulationSpec) -> None:
+        self.spec = spec
+        if spec.scene.endswith(".world"):
+            from sf_bringup.simulate.world import load_world
+
+            scene = load_world(Path(spec.scene))
+        elif spec.scene in SCENES:
+            scene = SCENES[spec.scene](spec.seed)
+        else:
+            raise ConfigError(f"scene '{spec.scene}' is unknown; choose a .world file or {', '.join(SCENES)}")
+        self.renderer = Renderer(scene)
+        self.path: CameraPath = oval(spec.path_plan, spec.seed)
+
+    def frame(self, index: int) -> tuple[np.ndarray, Float32, Float64]:
+        """Image, exact depth and T_map_camera of one frame."""
+        T = self.path.pose(index / self.spec.fps)
+        image, z = self.renderer.render(self.spec.camera, T, self.spec.supersampling)
+        rng = np.random.default_rng([self.spec.seed, 1, index])
+        if self.spec.image_noise:
+            noise = rng.standard_normal(image.shape, dtype=np.float32) * np.float32(self.spec.image_noise)
+            image = np.clip(image + noise + 0.5, 0, 255).astype(np.uint8)
+        return image, z, T
+
+    def sensor_depth(self, index: int, z: Float32) -> Float32:
+        """The depth sensor's reading of exact depth ``z``."""
+        rng = np.random.default_rng([self.spec.seed, 2, index])
+        if self.spec.depth == "structured_light":
+            return structured_light(z, self.spec.focal, rng)
+        return time_of_flight(z, rng) if self.spec.depth == "tof" else z
+
+    def sweep(self, index: int) -> tuple[PointCloud, Float32]:
+        """Sweep number ``index``, stamped at its start, which lies 0.4 periods before its forward look."""
+        period = 1 / self.spec.lidar_hz
+        start = (index - SWEEP_PHASE) * period
+        rng = np.random.default_rng([self.spec.seed, 3, index])
+        cloud, intensity = lidar_sweep(
+            self.renderer,
+            LIDARS[self.spec.lidar],
+            lambda t: self.path.pose(t) @ T_CAMERA_LIDAR,
+            start,
+            index,
+            period,
+            self.spec.lidar_fov_deg,
+            rng,
+        )
+        stamp = START_NS + round(start * 1e9)
+        return PointCloud(cloud.points, None, cloud.time_offset_ns, stamp, LIDAR), intensity
+
+
+def simulate(
+    spec: SimulationSpec, out: Path, progress: Callable[[int, int], None] | None = None
+) -> SimulationSummary:
+    """Write the recording of ``spec`` to the bag ``out``; ``progress`` gets (frames done, frames)."""
+    begun = time.perf_counter()
+    simulator = Simulator(spec)
+    sweeps = 0
+    with SequenceWriter(out) as writer:
+        first = START_NS - round(1e9 / spec.lidar_hz)
+        writer.tf_static("base_link", "camera_link", T_BASE_CAMERA_LINK, first)
+        writer.tf_static("camera_link", OPTICAL, T_LINK_OPTICAL, first)
+        if spec.lidar != "none":
+            writer.tf_static("base_link", LIDAR, T_BASE_LIDAR, first)
+        for k in range(spec.frames):
+            # sweeps that start up to this image; the last image also gets its own sweep
+            while spec.lidar != "none" and (sweeps - SWEEP_PHASE) / spec.lidar_hz <= k / spec.fps:
+                writer.cloud("/lidar/points", *simulator.sweep(sweeps))
+                sweeps += 1
+            _write_frame(writer, simulator, k)
+            if progress is not None:
+                progress(k + 1, spec.frames)
+    return SimulationSummary(out, spec.frames, sweeps, spec.frames / spec.fps, time.perf_counter() - begun)
+
+
+def _write_frame(writer: SequenceWriter, simulator: Simulator, index: int) -> None:
+    spec = simulator.spec
+    stamp = START_NS + round(index / spec.fps * 1e9)
+    image, z, T = simulator.frame(index)
+    if spec.rgb:
+        writer.image("/camera/color/image_raw", stamp, image, OPTICAL)
+    writer.camera_info("/camera/color/camera_info", stamp, spec.camera)
+    if spec.depth != "none":
+        encoding = "32FC1" if spec.depth == "exact" else "16UC1"
+        depth = DepthMap(simulator.sensor_depth(index, z))
+        writer.depth("/camera/depth/image_raw", stamp, depth, OPTICAL, encoding)
+    writer.pose("/ground_truth/pose", stamp, T, "map")
+    if spec.ground_truth_depth:
+        writer.depth("/ground_truth/depth/image", stamp, DepthMap(z), OPTICAL, "32FC1")
