@@ -48,7 +48,10 @@ class _Watch:
         for launch in line:
             topic = topics.stream(launch.name)
             node.create_subscription(
-                make(topic.type), topic.name, lambda m, n=launch.name: self._state(n, m), qos_profile(topic.qos)
+                make(topic.type),
+                topic.name,
+                lambda m, n=launch.name: self._state(n, m),
+                qos_profile(topic.qos),
             )
         for topic, take in (
             (topics.TRACKING_POSE, self._pose),
@@ -129,7 +132,9 @@ def _record_command(folder: RunFolder) -> list[str]:
     run = folder.path
     calibration = run / "calibration.json"
     info = folder.info()
-    calibration.write_text(json.dumps({"frames": json.dumps(info["frames"]), "topics": json.dumps(info["topics"])}))
+    calibration.write_text(
+        json.dumps({"frames": json.dumps(info["frames"]), "topics": json.dumps(info["topics"])})
+    )
     recorded = [*_RECORDED, *_ALSO_RECORDED]
     recorded += [topics.stream(block.split(":")[0]).name for block in info["line"]]
     attached = [str(run / name) for name in ("config.yaml", "trajectory.tum", "keyframes.tum")]
@@ -165,7 +170,9 @@ def _wait(
             rclpy.spin_once(node, timeout_sec=0.1)
             progress.update(watch.poses, given.leading_messages, f"{watch.keyframes} keyframes")
             for name, code in graph.dead().items():
-                raise SceneFactoryError(f"node {name} ended early with exit code {code}; see {logs_of(graph, name)}")
+                raise SceneFactoryError(
+                    f"node {name} ended early with exit code {code}; see {logs_of(graph, name)}"
+                )
             for helper in (player, recorder):
                 if helper.poll() not in (None, 0):
                     raise SceneFactoryError(
@@ -173,7 +180,9 @@ def _wait(
                     )
             if time.monotonic() - watch.news > _STALL_S:
                 waiting = sorted({launch.name for launch in line} - watch.finished)
-                raise SceneFactoryError(f"no news from {', '.join(waiting)} for {_STALL_S:g} s; see the logs beside the result")
+                raise SceneFactoryError(
+                    f"no news from {', '.join(waiting)} for {_STALL_S:g} s; see the logs beside the result"
+                )
 
 
 def logs_of(graph: Line, name: str) -> Path:

@@ -9,12 +9,12 @@ import numpy as np
 import yaml
 
 from sf_interfaces.errors import CalibrationError, FormatError
-from sf_interfaces.geometry import se3
 from sf_interfaces.io.bag import BagReader, is_bag
 from sf_interfaces.io.datasets import recognise
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.types import Camera, Float64, check_pose
+
 
 def convert(dataset: Path, out: Path) -> dict[str, int]:
     """Write a data set folder as one mcap bag; returns messages per topic.

@@ -6,7 +6,6 @@ from __future__ import annotations
 from types import TracebackType
 from typing import Any
 
-
 from sf_interfaces import topics
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.types import Frame, Keyframe, PointCloud, Trajectory, UInt8

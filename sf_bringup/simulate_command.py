@@ -11,14 +11,33 @@ from typing import Any
 
 from sf_interfaces.errors import ConfigError
 
-_CHANGES = ("frames", "fps", "width", "height", "focal", "depth", "lidar", "lidar_hz", "seed", "supersampling")
+_CHANGES = (
+    "frames",
+    "fps",
+    "width",
+    "height",
+    "focal",
+    "depth",
+    "lidar",
+    "lidar_hz",
+    "seed",
+    "supersampling",
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what can be changed of a preset."""
-    parser.add_argument("scene", help="a preset (demo, room, hall, palace, campus, room0-2, office0-4) or a .world file")
+    parser.add_argument(
+        "scene", help="a preset (demo, room, hall, palace, campus, room0-2, office0-4) or a .world file"
+    )
     parser.add_argument("out", type=Path, help="the bag to write, .mcap")
-    for name, kind in (("frames", int), ("width", int), ("height", int), ("seed", int), ("supersampling", int)):
+    for name, kind in (
+        ("frames", int),
+        ("width", int),
+        ("height", int),
+        ("seed", int),
+        ("supersampling", int),
+    ):
         parser.add_argument(f"--{name}", type=kind)
     for name in ("fps", "focal", "lidar-hz"):
         parser.add_argument(f"--{name}", type=float)
@@ -41,10 +60,14 @@ def simulate_command(args: argparse.Namespace) -> int:
         spec = PRESETS[args.scene]
     elif args.scene.endswith(".world"):
         if not Path(args.scene).is_file():
-            raise ConfigError(f"no world file {args.scene}; give an existing one or a preset: {', '.join(PRESETS)}")
+            raise ConfigError(
+                f"no world file {args.scene}; give an existing one or a preset: {', '.join(PRESETS)}"
+            )
         spec = SimulationSpec(args.scene)
     else:
-        raise ConfigError(f"unknown scene '{args.scene}'; choose a .world file or one of {', '.join(PRESETS)}")
+        raise ConfigError(
+            f"unknown scene '{args.scene}'; choose a .world file or one of {', '.join(PRESETS)}"
+        )
     changes: dict[str, Any] = {name: value for name in _CHANGES if (value := getattr(args, name)) is not None}
     if args.no_rgb:
         changes["rgb"] = False

@@ -47,7 +47,10 @@ class StructureCovariance:
         smooth = cv2.GaussianBlur(image.astype(np.float32) / 255.0, (0, 0), 1.0)
         feature = smooth.reshape(*image.shape[:2], -1)
         grey = feature.mean(axis=2)
-        gx, gy = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125)
+        gx, gy = (
+            cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125),
+            cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125),
+        )
         products = cv2.GaussianBlur(np.stack([gx * gx, gx * gy, gy * gy], axis=-1), (0, 0), 2.0)
         gain = self.edge_strength * (length_px / self.color_scale) ** 2
         xx, xy, yy = 1.0 + gain * products[..., 0], gain * products[..., 1], 1.0 + gain * products[..., 2]

@@ -60,7 +60,9 @@ class SequenceWriter:
 
     def path(self, topic: str, stamp_ns: int, trajectory: Trajectory) -> None:
         """All poses of a trajectory as nav_msgs/Path."""
-        self._write(topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns))
+        self._write(
+            topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns)
+        )
 
     def camera_info(self, topic: str, stamp_ns: int, camera: Camera) -> None:
         """Intrinsics, in the camera's frame."""

@@ -61,7 +61,9 @@ def _measured(frame: Frame, camera: Camera) -> tuple[SparseDepth, Float32]:
         return frame.sparse_depth, frame.sparse_depth.to_map(camera.height, camera.width).z
     if frame.depth is not None:
         return SparseDepth.from_map(frame.depth), np.where(frame.depth.valid, frame.depth.z, np.nan)
-    return SparseDepth(np.zeros((0, 2)), np.zeros(0)), np.full((camera.height, camera.width), np.nan, np.float32)
+    return SparseDepth(np.zeros((0, 2)), np.zeros(0)), np.full(
+        (camera.height, camera.width), np.nan, np.float32
+    )
 
 
 def _spread(score: Float64, uv: Float64, camera: Camera, count: int) -> NDArray[np.int64]:

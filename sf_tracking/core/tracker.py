@@ -53,12 +53,16 @@ class Tracker:
     frames and configuration give the same poses.
     """
 
-    def __init__(self, config: TrackingConfig = TrackingConfig(), operator: UpdateOperator | None = None) -> None:
+    def __init__(
+        self, config: TrackingConfig = TrackingConfig(), operator: UpdateOperator | None = None
+    ) -> None:
         self._config = config
         self._operator: UpdateOperator = operator or PatchAlignment(config)
         self._window: list[TrackedKeyframe] = []
         self._final: dict[int, Float64] = {}  # stamp of keyframe -> T_map_camera
-        self._relative: dict[int, tuple[int, Float64]] = {}  # stamp -> (stamp of its keyframe, T_keyframe_frame)
+        self._relative: dict[
+            int, tuple[int, Float64]
+        ] = {}  # stamp -> (stamp of its keyframe, T_keyframe_frame)
         self._recent: list[tuple[int, Float64]] = []  # the last two (stamp, T_cw), for the motion model
         self.state = TrackingState.INITIALISING
 
@@ -107,7 +111,9 @@ class Tracker:
         if frame.image is None or frame.camera is None:
             raise FormatError("tracking needs an image and its camera_info in every frame")
         if self._recent and frame.stamp_ns <= self._recent[-1][0]:
-            raise FormatError(f"frame stamp {frame.stamp_ns} does not increase; reset the tracker on a time jump")
+            raise FormatError(
+                f"frame stamp {frame.stamp_ns} does not increase; reset the tracker on a time jump"
+            )
         if self._window and frame.camera != self._window[-1].camera:
             raise FormatError("the camera changed within the sequence; start a new run for another camera")
         return frame.camera
@@ -135,7 +141,9 @@ class Tracker:
     def _locate(self, frame: Frame, gray: UInt8, camera: Camera) -> tuple[Float64 | None, Edges, int]:
         """Pose from the prediction; failing that with the full search range; failing that by descriptors."""
         known = len(self._recent) == 2
-        attempts = ([(self._predict(frame.stamp_ns), False)] if known else []) + [(self._predict(frame.stamp_ns), True)]
+        attempts = ([(self._predict(frame.stamp_ns), False)] if known else []) + [
+            (self._predict(frame.stamp_ns), True)
+        ]
         edges = Edges.concatenate([])
         for start, wide in attempts:
             T_cw, edges, inliers = self._align(gray, camera, start, wide)
@@ -199,9 +207,13 @@ class Tracker:
         keyframe = TrackedKeyframe(frame, gray, patches, T_cw)
         for index, source in enumerate(sources):
             mine = edges.source == index
-            part = Edges(*(getattr(edges, name)[mine] for name in ("source", "target", "points", "uv", "information")))
+            part = Edges(
+                *(getattr(edges, name)[mine] for name in ("source", "target", "points", "uv", "information"))
+            )
             keyframe.observed.append((source.frame.stamp_ns, part))
-            source.observed.append((frame.stamp_ns, self._edges([keyframe], source.gray, camera, source.T_cw, False)))
+            source.observed.append(
+                (frame.stamp_ns, self._edges([keyframe], source.gray, camera, source.T_cw, False))
+            )
         self._window.append(keyframe)
         self._optimise(camera)
         return (self._retire(),) if len(self._window) > self._config.window else ()
