@@ -100,16 +100,12 @@ def main() -> int:
         for compression in ("none", "zstd"):
             for rate in given.rates:
                 rows.append(measure(bag, rate, compression, 100 + len(rows)))
-                print(
-                    {k: round(v, 2) if isinstance(v, float) else v for k, v in rows[-1].items()}, flush=True
-                )
+                print({k: round(v, 2) if isinstance(v, float) else v for k, v in rows[-1].items()}, flush=True)
                 if not rows[-1]["sustained"]:
                     break
     report = {
         "machine": {"cpus": os.cpu_count(), "cpu": platform.processor(), "python": platform.python_version()},
-        "versions": {
-            name: version(name) for name in ("ros-rclpy", "ros-fastrtps", "rosbags", "mcap", "zstandard")
-        },
+        "versions": {name: version(name) for name in ("ros-rclpy", "ros-fastrtps", "rosbags", "mcap", "zstandard")},
         "results": rows,
     }
     given.out.write_text(json.dumps(report, indent=1))

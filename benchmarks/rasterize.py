@@ -49,9 +49,7 @@ def options_for(resolution: float) -> RasterOptions:
     return RasterOptions(radius=resolution, near=10 * resolution, layer_gap=4 * resolution)
 
 
-def measure(
-    points: np.ndarray, camera: Camera, options: RasterOptions, threads: int, repeats: int
-) -> dict[str, Any]:
+def measure(points: np.ndarray, camera: Camera, options: RasterOptions, threads: int, repeats: int) -> dict[str, Any]:
     """Median and fastest wall time, process time, and the fraction of holes."""
     wall, cpu = [], []
     for _ in range(repeats + 1):

@@ -192,14 +192,10 @@ def build_parser() -> argparse.ArgumentParser:
     _add_input(p)
     p.add_argument("--engine", choices=("inproc", "ros"), default="inproc")
     p.add_argument("--out", type=Path, default=Path("out"))
-    p.add_argument(
-        "--extrinsic", type=Path, help="T_camera_lidar as a 4x4 text file, if the input has no /tf_static"
-    )
+    p.add_argument("--extrinsic", type=Path, help="T_camera_lidar as a 4x4 text file, if the input has no /tf_static")
     p.add_argument("--config", type=Path)
     p.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
-    p.add_argument(
-        "--rate", type=float, default=0.0, help="play live at this rate (ros engine); 0 = lossless"
-    )
+    p.add_argument("--rate", type=float, default=0.0, help="play live at this rate (ros engine); 0 = lossless")
 
     _add_input(verb("plan", _plan, "print the line and why, without computing"))
     for name, (_, help) in PASSED_ON.items():
@@ -236,9 +232,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("measure", choices=("traj", "depth", "completion", "render"))
     p.add_argument("run", type=Path)
     p.add_argument("--reference", type=Path, help="TUM trajectory (default: /ground_truth/pose of the input)")
-    p.add_argument(
-        "--holdout", type=float, default=0.5, help="fraction of LiDAR points to predict (completion)"
-    )
+    p.add_argument("--holdout", type=float, default=0.5, help="fraction of LiDAR points to predict (completion)")
     verb("report", _report, "write report.html and the picture of a run").add_argument("run", type=Path)
     return parser
 

@@ -70,11 +70,7 @@ class _Decision:
             return
         best = candidates[0]
         self.roles[role] = best
-        others = (
-            f"; {', '.join(candidates[1:])} left out (choose with --map {role}=TOPIC)"
-            if candidates[1:]
-            else ""
-        )
+        others = f"; {', '.join(candidates[1:])} left out (choose with --map {role}=TOPIC)" if candidates[1:] else ""
         self.reasons.append(f"{role} from {best}, {why}{others}")
 
 
@@ -83,9 +79,7 @@ def _check_user(user: Mapping[str, str], types: Mapping[str, str]) -> None:
         if role not in ROLES:
             raise ConfigError(f"--map {role}={topic}: unknown role; roles are {', '.join(ROLES)}")
         if topic not in types:
-            raise ConfigError(
-                f"--map {role}={topic}: no such topic; there are {', '.join(sorted(types)) or 'none'}"
-            )
+            raise ConfigError(f"--map {role}={topic}: no such topic; there are {', '.join(sorted(types)) or 'none'}")
         if types[topic] != ROLES[role]:
             raise ConfigError(f"--map {role}={topic}: it has type {types[topic]}, {role} needs {ROLES[role]}")
 
@@ -139,9 +133,7 @@ def discover(
     if leader and namespace(leader) in infos:
         decision.choose("camera_info", [infos[namespace(leader)]], f"in the namespace of {leader}")
     decision.reasons += [
-        f"{n} ignored: no block takes {kind}"
-        for n, kind in sorted(inputs.items())
-        if kind not in ROLES.values()
+        f"{n} ignored: no block takes {kind}" for n, kind in sorted(inputs.items()) if kind not in ROLES.values()
     ]
     return InputMapping(decision.roles, _available(decision.roles, probes), tuple(decision.reasons))
 

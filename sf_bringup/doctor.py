@@ -57,16 +57,12 @@ def _shared_memory() -> Check:
             "/dev/shm is missing: images go over UDP and are slow; mount a tmpfs there",
         )
     free = shutil.disk_usage("/dev/shm").free // 2**20
-    return Check(
-        "shared memory", free > 512, f"{free} MB free in /dev/shm (512 MB wanted for large messages)"
-    )
+    return Check("shared memory", free > 512, f"{free} MB free in /dev/shm (512 MB wanted for large messages)")
 
 
 def _blocks() -> Check:
     specs = load_blocks()
-    return Check(
-        "blocks", bool(specs), ", ".join(s.id for s in specs) or "none installed; reinstall with make"
-    )
+    return Check("blocks", bool(specs), ", ".join(s.id for s in specs) or "none installed; reinstall with make")
 
 
 def _torch() -> Check:

@@ -90,9 +90,7 @@ def _parent_node() -> Iterator[Node]:
         rclpy.try_shutdown()
 
 
-def run_graph(
-    folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float
-) -> dict[str, int]:
+def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float) -> dict[str, int]:
     """Play the bag through the line's processes until the last node has finished; record everything.
 
     Args:
@@ -132,9 +130,7 @@ def _record_command(folder: RunFolder) -> list[str]:
     run = folder.path
     calibration = run / "calibration.json"
     info = folder.info()
-    calibration.write_text(
-        json.dumps({"frames": json.dumps(info["frames"]), "topics": json.dumps(info["topics"])})
-    )
+    calibration.write_text(json.dumps({"frames": json.dumps(info["frames"]), "topics": json.dumps(info["topics"])}))
     recorded = [*_RECORDED, *_ALSO_RECORDED]
     recorded += [topics.stream(block.split(":")[0]).name for block in info["line"]]
     attached = [str(run / name) for name in ("config.yaml", "trajectory.tum", "keyframes.tum")]
@@ -146,7 +142,7 @@ def _record_command(folder: RunFolder) -> list[str]:
 
 def _play_command(given: BagInput, line: tuple[NodeLaunch, ...], rate: float) -> list[str]:
     roles = given.mapping.roles
-    played = [*roles.values(), topics.TF.name, topics.TF_STATIC.name]
+    played = [*roles.values(), *given.transform_topics]
     command = [sys.executable, "-m", "sf_bringup.player", str(given.bag), "--topics", *played]
     command += ["--head", roles.get("rgb", roles.get("depth", ""))]
     if rate:
@@ -170,9 +166,7 @@ def _wait(
             rclpy.spin_once(node, timeout_sec=0.1)
             progress.update(watch.poses, given.leading_messages, f"{watch.keyframes} keyframes")
             for name, code in graph.dead().items():
-                raise SceneFactoryError(
-                    f"node {name} ended early with exit code {code}; see {logs_of(graph, name)}"
-                )
+                raise SceneFactoryError(f"node {name} ended early with exit code {code}; see {logs_of(graph, name)}")
             for helper in (player, recorder):
                 if helper.poll() not in (None, 0):
                     raise SceneFactoryError(

@@ -82,9 +82,7 @@ def read_extrinsic(path: Path) -> Float64:
     try:
         return check_pose(np.loadtxt(path), f"extrinsic {path}")
     except (OSError, ValueError, FormatError) as error:
-        raise CalibrationError(
-            f"cannot read T_camera_lidar from {path}: {error}; give 4 rows of 4 numbers"
-        ) from error
+        raise CalibrationError(f"cannot read T_camera_lidar from {path}: {error}; give 4 rows of 4 numbers") from error
 
 
 def with_given(

@@ -86,9 +86,7 @@ class Line:
             request = ChangeState.Request(transition=Transition(id=transition))
             answer = self._call(name, "change_state", ChangeState, request)
             if not answer.success:
-                raise ConfigError(
-                    f"node {name} refused to start: {self._running[name].process.last_lines(3)}"
-                )
+                raise ConfigError(f"node {name} refused to start: {self._running[name].process.last_lines(3)}")
 
     def is_active(self, name: str) -> bool:
         """Whether the node answers and is in its active state."""
@@ -115,9 +113,7 @@ class Line:
                 )
             if running.restart_at is None:
                 running.restart_at = now + _BACK_OFF_S[running.restarts]
-                said.append(
-                    f"node {name} died with exit code {code}, restart in {_BACK_OFF_S[running.restarts]:g} s"
-                )
+                said.append(f"node {name} died with exit code {code}, restart in {_BACK_OFF_S[running.restarts]:g} s")
             elif now >= running.restart_at:
                 running.restarts, running.restart_at = running.restarts + 1, None
                 running.process = self._spawn(running.launch)
@@ -145,9 +141,7 @@ class Line:
                         f"node {name} ended with exit code {process.poll()} while starting: {process.last_lines(3)}"
                     )
                 if time.monotonic() > deadline:
-                    raise SceneFactoryError(
-                        f"node {name} did not start within {_START_S:g} s; see {process.log}"
-                    )
+                    raise SceneFactoryError(f"node {name} did not start within {_START_S:g} s; see {process.log}")
             future = client.call_async(request)
             rclpy.spin_until_future_complete(self._node, future, timeout_sec=_TRANSITION_S)
             if not future.done():

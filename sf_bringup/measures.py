@@ -43,9 +43,7 @@ def reference_trajectory(bag: Path) -> Trajectory | None:
     return Trajectory.from_pairs(list(pairs.items()))
 
 
-def decoded(
-    bag: Path, topic: str, decode: Callable[[Any], Any], stamps: set[int]
-) -> Iterator[tuple[int, Any]]:
+def decoded(bag: Path, topic: str, decode: Callable[[Any], Any], stamps: set[int]) -> Iterator[tuple[int, Any]]:
     """(stamp, decoded message) of one topic, only for header stamps in ``stamps``."""
     with BagReader(bag) as reader:
         if topic not in reader.topics:
@@ -156,9 +154,7 @@ def render_held_out(run: RunFolder) -> list[tuple[int, UInt8, UInt8, np.ndarray]
 def render_scores(views: list[tuple[int, UInt8, UInt8, np.ndarray]]) -> dict[str, float]:
     """Median PSNR over the surface and over the whole image, and the fraction of pixels with a surface."""
     if not views:
-        raise FormatError(
-            "no held-out frame to render: the run has no colour field or every frame is a keyframe"
-        )
+        raise FormatError("no held-out frame to render: the run has no colour field or every frame is a keyframe")
     real = [r if r.ndim == 3 else np.repeat(r[..., None], 3, axis=2) for _, _, r, _ in views]
     surface = [psnr(v[1], r, v[3]) for v, r in zip(views, real, strict=True) if v[3].any()]
     return {

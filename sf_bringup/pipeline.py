@@ -110,9 +110,7 @@ class ProductionLine:
             self._writer.surface(keyframe.stamp_ns, self.reconstruction.add(keyframe))
 
 
-def run_inproc(
-    folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float
-) -> dict[str, int]:
+def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float) -> dict[str, int]:
     """Take a bag through the line in this process and record the same topics the graph would.
 
     Args:
@@ -131,7 +129,8 @@ def run_inproc(
     values = {**sync_values(made, roles, head), **config.sections.get("sync", {})}
     values["image"] = "rgb" in roles
     inputs = SensorInputs(build(SyncConfig, values, "section 'sync'"), lossless=True)
-    kinds = {topic: _KIND[role] for role, topic in roles.items()} | {"/tf": "tf", "/tf_static": "tf_static"}
+    kinds = {topic: _KIND[role] for role, topic in roles.items()}
+    kinds |= {topic: topic[1:] for topic in given.transform_topics}
     with (
         BagReader(given.bag) as reader,
         ResultWriter(SequenceWriter(folder.result)) as writer,
@@ -139,7 +138,7 @@ def run_inproc(
     ):
         line = ProductionLine(made.ids, config, writer)
         done = 0
-        for raw in reader.messages([t for t in kinds if t in reader.topics]):
+        for raw in reader.messages(list(kinds)):
             inputs.push(kinds[raw.topic], reader.decode(raw))
             for frame in inputs.assembler.ready():
                 inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))

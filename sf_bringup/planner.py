@@ -172,9 +172,7 @@ def _given(available: Iterable[Quantity]) -> frozenset[Quantity]:
     return frozenset(given)
 
 
-def plan(
-    available: Iterable[Quantity], goal: str, blocks: Sequence[BlockSpec], use: Iterable[str] = ()
-) -> Plan:
+def plan(available: Iterable[Quantity], goal: str, blocks: Sequence[BlockSpec], use: Iterable[str] = ()) -> Plan:
     """The production line for a goal.
 
     Args:

@@ -64,9 +64,7 @@ class PlayOptions:
         if self.in_flight < 1:
             raise ConfigError(f"--in-flight {self.in_flight} must be at least 1")
         if self.lossless and not self.consumed:
-            raise ConfigError(
-                "--lossless needs --consumed TOPIC, where a head node tells what it has taken in"
-            )
+            raise ConfigError("--lossless needs --consumed TOPIC, where a head node tells what it has taken in")
 
 
 class Credits:
@@ -126,7 +124,8 @@ def prefetch(messages: Iterator[RawMessage], size: int = 64) -> Iterator[RawMess
     def put(item: RawMessage | BaseException | None) -> None:
         while not stop.is_set():
             try:
-                return ahead.put(item, timeout=0.1)
+                ahead.put(item, timeout=0.1)
+                return
             except queue.Full:
                 continue
 
@@ -180,9 +179,7 @@ class Player:
         for name in self._options.topics or self._bag.topics:
             info = self._bag.topics.get(name)
             if info is None:
-                raise FormatError(
-                    f"bag {self._bag.path} has no topic {name}; it has {', '.join(self._bag.topics)}"
-                )
+                raise FormatError(f"bag {self._bag.path} has no topic {name}; it has {', '.join(self._bag.topics)}")
             if name == CLOCK.name:
                 continue
             latched = name.endswith("/tf_static") or "durability: 1" in info.qos
@@ -208,9 +205,7 @@ class Player:
 
     def _subscribe_credits(self, topic: str) -> None:
         kind = rclpy_factory("builtin_interfaces/msg/Time")
-        self._node.create_subscription(
-            kind, topic, lambda msg: self._credits.consumed(topic, to_ns(msg)), 1000
-        )
+        self._node.create_subscription(kind, topic, lambda msg: self._credits.consumed(topic, to_ns(msg)), 1000)
 
     def _spin(self, seconds: float) -> None:
         self._executor.spin_once(timeout_sec=max(0.0, seconds))
@@ -240,9 +235,7 @@ class Player:
     def _tick(self, now_ns: int) -> None:
         if now_ns - self._clock_ns >= _TICK_NS or now_ns < self._clock_ns:
             self._clock_ns = now_ns
-            self._clock.publish(
-                rclpy_factory("rosgraph_msgs/msg/Clock")(clock=to_stamp(rclpy_factory, now_ns))
-            )
+            self._clock.publish(rclpy_factory("rosgraph_msgs/msg/Clock")(clock=to_stamp(rclpy_factory, now_ns)))
 
     def _pace(self, stamp_ns: int, start_ns: int, start_wall: float) -> None:
         """Sleep until a log time is due, while the clock goes on."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from sf_bringup import discovery
 from sf_bringup.discovery import InputMapping, Probe
+from sf_interfaces import topics
 from sf_interfaces.blocks import Quantity
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.io.bag import BagReader, RawMessage
@@ -26,6 +27,7 @@ class BagInput:
     mapping: InputMapping
     frames: Mapping[str, str]  # role -> frame_id of its first message
     static: FrameTree
+    transform_topics: tuple[str, ...]
     seconds: float
     leading_messages: int  # images, or depth images where there are none: the frames of the run
 
@@ -78,7 +80,8 @@ def inspect(bag: Path, user: Mapping[str, str]) -> BagInput:
         leader = mapping.roles.get("rgb") or mapping.roles.get("depth", "")
         count = reader.topics[leader].count if leader else 0
         seconds = (reader.end_ns - reader.start_ns) * 1e-9
-        return BagInput(bag, mapping, frames, _static_frames(reader), seconds, count)
+        transforms = tuple(t for t in (topics.TF_STATIC.name, topics.TF.name) if t in reader.topics)
+        return BagInput(bag, mapping, frames, _static_frames(reader), transforms, seconds, count)
 
 
 def check_extrinsic(given: BagInput) -> None:

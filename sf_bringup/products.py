@@ -76,7 +76,5 @@ def view(run_path: Path) -> None:
     """
     surface = _surface_file(RunFolder.open(run_path))
     if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigError(
-            f"no display to open a window on; open {surface} or {run_path}/report.html elsewhere"
-        )
+        raise ConfigError(f"no display to open a window on; open {surface} or {run_path}/report.html elsewhere")
     o3d.visualization.draw_geometries([o3d.io.read_point_cloud(str(surface))], window_name=str(surface))

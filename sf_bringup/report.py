@@ -40,9 +40,7 @@ class Row:
     value: str
 
 
-def _depth_panel(
-    axis: Any, z: Float64, title: str, figure: Figure, unit: str = "m", cmap: str = "turbo"
-) -> None:
+def _depth_panel(axis: Any, z: Float64, title: str, figure: Figure, unit: str = "m", cmap: str = "turbo") -> None:
     finite = z[np.isfinite(z)]
     low, high = np.percentile(finite, (2, 98)) if finite.size else (0.0, 1.0)
     shown = axis.imshow(z, cmap=cmap, vmin=low, vmax=max(high, low + 1e-6), interpolation="nearest")
@@ -151,8 +149,7 @@ def write_report(
         for name, figure in figures.items()
     )
     blocks = "".join(
-        f"<h2>{html.escape(name)}</h2><pre>{html.escape(_text(value))}</pre>"
-        for name, value in details.items()
+        f"<h2>{html.escape(name)}</h2><pre>{html.escape(_text(value))}</pre>" for name, value in details.items()
     )
     style = (
         "body{font-family:sans-serif;max-width:1300px;margin:2em auto;padding:0 1em}"

@@ -34,9 +34,7 @@ class RunFolder:
             FormatError: the folder holds no ``run.json``.
         """
         if not (path / "run.json").is_file():
-            raise FormatError(
-                f"{path} is not the output of a run (no run.json); give the --out folder of 'sf run'"
-            )
+            raise FormatError(f"{path} is not the output of a run (no run.json); give the --out folder of 'sf run'")
         return RunFolder(path)
 
     @property
@@ -73,7 +71,7 @@ class RunFolder:
         """Depth with variance of each keyframe, by stamp."""
         for path in sorted((self.path / "depth").glob("*.npz")):
             with np.load(path) as data:
-                yield int(path.stem), DepthMap(data["z"], data["variance"] if "variance" in data else None)
+                yield int(path.stem), DepthMap(data["z"], data.get("variance"))
 
     def camera(self) -> Camera:
         """The camera of the run."""

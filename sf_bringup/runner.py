@@ -96,9 +96,7 @@ def explain(
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as scratch:
-        request = RunRequest(
-            paths, goal, out=Path(scratch), calibration=calibration, poses=poses, mapping=user
-        )
+        request = RunRequest(paths, goal, out=Path(scratch), calibration=calibration, poses=poses, mapping=user)
         given = prepare(request)
     made = plan(given.mapping.available, goal, load_blocks())
     reasons = [*given.mapping.reasons, *made.explain().splitlines()]
@@ -119,12 +117,7 @@ def run(request: RunRequest) -> Summary:
     given = prepare(request)
     made = plan(given.mapping.available, request.goal, load_blocks())
     made.check_runnable()
-    if any(
-        step.sources.get(q) == "input"
-        for step in made.steps
-        for q in step.sources
-        if q.name == "SPARSE_DEPTH"
-    ):
+    if any(step.sources.get(q) == "input" for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
         preflight.check_extrinsic(given)
     config = ConfigFile.load(request.config, request.overrides)
     config.check_sections(SECTIONS)
@@ -150,9 +143,7 @@ def _engine(name: str) -> Any:
     return run_inproc
 
 
-def _write_facts(
-    folder: RunFolder, request: RunRequest, given: BagInput, made: Plan, config: ConfigFile
-) -> None:
+def _write_facts(folder: RunFolder, request: RunRequest, given: BagInput, made: Plan, config: ConfigFile) -> None:
     """``run.json`` and the effective ``config.yaml``, before anything runs: a broken run explains itself too."""
     facts = {
         "input": [str(p) for p in request.inputs],

@@ -60,14 +60,10 @@ def simulate_command(args: argparse.Namespace) -> int:
         spec = PRESETS[args.scene]
     elif args.scene.endswith(".world"):
         if not Path(args.scene).is_file():
-            raise ConfigError(
-                f"no world file {args.scene}; give an existing one or a preset: {', '.join(PRESETS)}"
-            )
+            raise ConfigError(f"no world file {args.scene}; give an existing one or a preset: {', '.join(PRESETS)}")
         spec = SimulationSpec(args.scene)
     else:
-        raise ConfigError(
-            f"unknown scene '{args.scene}'; choose a .world file or one of {', '.join(PRESETS)}"
-        )
+        raise ConfigError(f"unknown scene '{args.scene}'; choose a .world file or one of {', '.join(PRESETS)}")
     changes: dict[str, Any] = {name: value for name in _CHANGES if (value := getattr(args, name)) is not None}
     if args.no_rgb:
         changes["rgb"] = False
@@ -83,6 +79,8 @@ def simulate_command(args: argparse.Namespace) -> int:
         "seconds": made.duration_s,
         "wall_seconds": made.wall_s,
     }
-    text = f"wrote {args.out}: {made.frames} frames, {made.sweeps} sweeps, {made.duration_s:.1f} s in {made.wall_s:.1f} s"
+    text = (
+        f"wrote {args.out}: {made.frames} frames, {made.sweeps} sweeps, {made.duration_s:.1f} s in {made.wall_s:.1f} s"
+    )
     print(json.dumps(value) if args.json else text)
     return 0

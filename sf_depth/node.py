@@ -61,9 +61,7 @@ class DepthNode(BlockNode):
         publish_bundle(self, dense, COMPLETED, self._parts)
         self.health.count("keyframes completed")
         if self.wanted(topics.DENSE_POINTS):
-            self.output(topics.DENSE_POINTS).publish(
-                messages.encode_cloud(messages.rclpy_factory, _points(dense))
-            )
+            self.output(topics.DENSE_POINTS).publish(messages.encode_cloud(messages.rclpy_factory, _points(dense)))
         self.sent_one(dense.stamp_ns)
 
 

@@ -27,8 +27,6 @@ class FlexionConfig:
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:
-            raise ConfigError(
-                f"flexion variant '{self.variant}' is unknown; choose one of {', '.join(VARIANTS)}"
-            )
+            raise ConfigError(f"flexion variant '{self.variant}' is unknown; choose one of {', '.join(VARIANTS)}")
         if self.median % 2 == 0:
             raise ConfigError(f"flexion median must be odd, got {self.median}")

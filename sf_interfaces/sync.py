@@ -195,9 +195,7 @@ class FrameAssembler:
         if known != (camera, distortion):
             self._count("camera_info changed within the stream: the first calibration is kept")
 
-    def push_transform(
-        self, parent: str, child: str, T: Float64, stamp_ns: int = 0, *, static: bool = True
-    ) -> None:
+    def push_transform(self, parent: str, child: str, T: Float64, stamp_ns: int = 0, *, static: bool = True) -> None:
         """One link ``T_parent_child`` of /tf_static (or /tf: used for publishing, never for extrinsics)."""
         self.transforms.add(parent, child, T, stamp_ns, static=static)
 
@@ -345,8 +343,7 @@ class FrameAssembler:
             found = self.transforms.lookup(self.config.pose_frame, camera_frame, static_only=True)
             if found is None:
                 raise CalibrationError(
-                    f"no transform from '{camera_frame}' to '{self.config.pose_frame}': "
-                    "publish it on /tf_static"
+                    f"no transform from '{camera_frame}' to '{self.config.pose_frame}': publish it on /tf_static"
                 )
             T_child_camera = found
         if t0 == t1:
@@ -389,8 +386,7 @@ class FrameAssembler:
 
     def _no_extrinsic(self, camera_frame: str) -> str:
         return (
-            f"no transform from '{self._lidar_frame}' to '{camera_frame}': "
-            "publish it on /tf_static or pass --extrinsic"
+            f"no transform from '{self._lidar_frame}' to '{camera_frame}': publish it on /tf_static or pass --extrinsic"
         )
 
     def _forget(self, key: _Key) -> None:

@@ -90,9 +90,7 @@ class Camera:
         """The camera of the image resized by ``factor`` (exact: centres are at + 0.5)."""
         w, h = max(1, round(self.width * factor)), max(1, round(self.height * factor))
         sx, sy = w / self.width, h / self.height
-        return replace(
-            self, width=w, height=h, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
-        )
+        return replace(self, width=w, height=h, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy)
 
     def project(self, points: Float64) -> tuple[Float64, Float64]:
         """Camera points [..., 3] m -> continuous pixels [..., 2] and depth z [...]. No z check is made."""

@@ -15,9 +15,7 @@ class ReconConfig:
     resolution: float = option(
         0.0, "spacing of the finest points, m; 0: the median pixel footprint of the first keyframe", low=0.0
     )
-    min_resolution: float = option(
-        0.005, "lower bound of the automatic resolution for metric depth, m", low=0.0
-    )
+    min_resolution: float = option(0.005, "lower bound of the automatic resolution for metric depth, m", low=0.0)
     levels: int = option(3, "number of resolutions", low=1, high=8)
     multiplier: float = option(4.0, "ratio of successive resolutions", low=1.5, high=16.0)
     features: int = option(8, "length of a point's feature on each level", low=1, high=64)
@@ -44,9 +42,7 @@ class ReconConfig:
     k_ray: int = option(8, "points drawn into one pixel at most (K_ray)", low=1, high=64)
     coverage: float = option(2.0, "side of a point's window on screen, in resolutions", low=0.1, high=10.0)
     layer_gap: float = option(4.0, "step in depth that ends the first layer, in resolutions", low=0.0)
-    ray_sigma: float = option(
-        0.5, "screen weight exp(-q2 / ray_sigma), q in half-widths of the window", low=0.01
-    )
+    ray_sigma: float = option(0.5, "screen weight exp(-q2 / ray_sigma), q in half-widths of the window", low=0.01)
     max_window: int = option(64, "cap of a window's half-width, px", low=1, high=1024)
     threads: int = option(0, "threads of the compiled kernels; 0: all", low=0)
     seed: int = option(0, "seed of all random draws", low=0)

@@ -25,15 +25,9 @@ class TrackingConfig:
     damping: float = option(0.5, "share of the last motion that predicts the next", low=0.0, high=1.0)
     min_inliers: int = option(25, "edges that a pose has to agree with", low=6)
     inlier_px: float = option(2.0, "reprojection error of an agreeing edge, px", low=0.1)
-    keyframe_flow: float = option(
-        0.045, "mean flow that makes a keyframe, as part of the image width", low=0.001
-    )
-    keyframe_overlap: float = option(
-        0.6, "share of patches still aligned below which a keyframe is made", high=1.0
-    )
+    keyframe_flow: float = option(0.045, "mean flow that makes a keyframe, as part of the image width", low=0.001)
+    keyframe_overlap: float = option(0.6, "share of patches still aligned below which a keyframe is made", high=1.0)
     depth_gap: float = option(0.08, "relative depth step near a patch above which it is rejected", low=0.0)
-    min_quality: float = option(
-        0.002, "corner quality of a patch relative to the image's best", low=0.0, high=1.0
-    )
+    min_quality: float = option(0.002, "corner quality of a patch relative to the image's best", low=0.0, high=1.0)
     max_depth: float = option(80.0, "patches farther away are not used, m", low=0.1)
     seed: int = option(0, "seed of the wide search")

@@ -29,9 +29,7 @@ def imports(path: Path) -> Iterator[tuple[int, str]]:
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            anchor = (
-                ".".join(path.parent.parts[: len(path.parent.parts) - node.level + 1]) if node.level else ""
-            )
+            anchor = ".".join(path.parent.parts[: len(path.parent.parts) - node.level + 1]) if node.level else ""
             base = ".".join(part for part in (anchor, node.module) if part)
             yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
 
@@ -61,11 +59,7 @@ def test_top_level_holds_no_other_package() -> None:
 
 @pytest.mark.parametrize("block", BLOCKS)
 def test_a_block_has_the_four_names(block: str) -> None:
-    missing = [
-        n
-        for n in ("block.py", "config.py", "node.py", "core/__init__.py")
-        if not (ROOT / block / n).is_file()
-    ]
+    missing = [n for n in ("block.py", "config.py", "node.py", "core/__init__.py") if not (ROOT / block / n).is_file()]
     report(missing, f"missing in {block}")
 
 
@@ -111,9 +105,7 @@ def test_files_and_functions_stay_short() -> None:
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 size = (node.end_lineno or node.lineno) - node.lineno + 1
                 if size > MAX_FUNCTION:
-                    found.append(
-                        f"{path}:{node.lineno} {node.name}() has {size} lines, at most {MAX_FUNCTION}"
-                    )
+                    found.append(f"{path}:{node.lineno} {node.name}() has {size} lines, at most {MAX_FUNCTION}")
     report(found, "too long")
 
 

@@ -59,9 +59,7 @@ needs_install = pytest.mark.skipif(
 def test_every_block_and_the_command_are_registered() -> None:
     names = {point.name for point in entry_points(group="scenefactory.blocks")}
     assert {"tracking", "flexion", "depth", "recon"} <= names
-    assert any(
-        p.name == "sf" and p.value == "sf_bringup.cli:main" for p in entry_points(group="console_scripts")
-    )
+    assert any(p.name == "sf" and p.value == "sf_bringup.cli:main" for p in entry_points(group="console_scripts"))
 
 
 @needs_install

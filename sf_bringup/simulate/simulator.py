@@ -91,9 +91,7 @@ class Simulator:
         return PointCloud(cloud.points, None, cloud.time_offset_ns, stamp, LIDAR), intensity
 
 
-def simulate(
-    spec: SimulationSpec, out: Path, progress: Callable[[int, int], None] | None = None
-) -> SimulationSummary:
+def simulate(spec: SimulationSpec, out: Path, progress: Callable[[int, int], None] | None = None) -> SimulationSummary:
     """Write the recording of ``spec`` to the bag ``out``; ``progress`` gets (frames done, frames)."""
     begun = time.perf_counter()
     simulator = Simulator(spec)

@@ -56,9 +56,7 @@ def _gather(pixels: PixelCovariance, index: np.ndarray) -> tuple[torch.Tensor, t
     return torch.from_numpy(pixels.shape[row, col]), torch.from_numpy(pixels.feature[row, col])
 
 
-def solve(
-    observed: Observations, near: np.ndarray, center: Float64, pixels: PixelCovariance, nugget: float
-) -> Solved:
+def solve(observed: Observations, near: np.ndarray, center: Float64, pixels: PixelCovariance, nugget: float) -> Solved:
     """Condition tiles with centres [B, 2] (row, col) on the observations ``near`` [B, K]."""
     index = observed.index[near]
     x = torch.from_numpy((index - center[:, None]).astype(np.float32))[..., [1, 0]]

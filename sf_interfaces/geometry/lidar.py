@@ -22,9 +22,7 @@ def _check_points(points: ArrayLike) -> Float64:
     return out
 
 
-def deskew(
-    points: ArrayLike, time_offset_ns: ArrayLike, twist: ArrayLike, reference_offset_ns: int = 0
-) -> Float64:
+def deskew(points: ArrayLike, time_offset_ns: ArrayLike, twist: ArrayLike, reference_offset_ns: int = 0) -> Float64:
     """Move every point to where a sensor standing still at the reference instant would have measured it.
 
     The motion is a constant body twist: ``T_world_lidar(t) = T_world_lidar(ref) exp((t - ref) twist)``. The
@@ -99,9 +97,7 @@ def occluded(uv: Float64, z: Float64, width: int, height: int, margin: float = 0
     hidden = np.ones(len(z), dtype=bool)
     for x in (0, side - 1):
         for y in (0, side - 1):
-            nearest = cv2.erode(
-                near, kernel, anchor=(x, y), borderType=cv2.BORDER_CONSTANT, borderValue=np.inf
-            )
+            nearest = cv2.erode(near, kernel, anchor=(x, y), borderType=cv2.BORDER_CONSTANT, borderValue=np.inf)
             hidden &= nearest[row, col] < limit
     return hidden
 

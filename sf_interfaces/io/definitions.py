@@ -17,9 +17,7 @@ def _definition_file(name: str) -> Path | None:
     """The .msg file of a type: in this checkout for our own, else in an installed share folder."""
     package, short = name.split("/")[0], name.split("/")[-1]
     prefixes = [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-    candidates = [
-        prefix / "share" / package / "msg" / f"{short}.msg" for prefix in (*prefixes, Path(sys.prefix))
-    ]
+    candidates = [prefix / "share" / package / "msg" / f"{short}.msg" for prefix in (*prefixes, Path(sys.prefix))]
     own = Path(__file__).resolve().parents[1]
     if package == own.name:
         candidates.insert(0, own / "msg" / f"{short}.msg")

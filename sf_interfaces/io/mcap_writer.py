@@ -102,9 +102,7 @@ class McapWriter:
     def __enter__(self) -> McapWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, e: BaseException | None, t: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, e: BaseException | None, t: TracebackType | None) -> None:
         self.close()
 
     @property
@@ -255,8 +253,6 @@ class McapWriter:
         records = [*self._schemas.values(), *self._channels.values(), statistics, *self._indexes]
         summary = b"".join(_bytes(record) for record in records)
         crc = zlib.crc32(summary + struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0))
-        self._file.write(
-            summary + _bytes(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc))
-        )
+        self._file.write(summary + _bytes(Footer(summary_start=start, summary_offset_start=0, summary_crc=crc)))
         self._file.write(_MAGIC)
         self._file.close()

@@ -28,9 +28,7 @@ class SequenceWriter:
     def __enter__(self) -> SequenceWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, e: BaseException | None, t: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, e: BaseException | None, t: TracebackType | None) -> None:
         self.close()
 
     def close(self) -> None:
@@ -47,9 +45,7 @@ class SequenceWriter:
         """RGB [H, W, 3] or mono [H, W] uint8."""
         self._write(topic, _IMAGE, stamp_ns, messages.encode_image(self._make, image, stamp_ns, frame_id))
 
-    def depth(
-        self, topic: str, stamp_ns: int, depth: DepthMap, frame_id: str, encoding: str = "16UC1"
-    ) -> None:
+    def depth(self, topic: str, stamp_ns: int, depth: DepthMap, frame_id: str, encoding: str = "16UC1") -> None:
         """Depth as 16UC1 (mm) or 32FC1 (m)."""
         msg = messages.encode_depth(self._make, depth, stamp_ns, frame_id, encoding)
         self._write(topic, _IMAGE, stamp_ns, msg)
@@ -60,9 +56,7 @@ class SequenceWriter:
 
     def path(self, topic: str, stamp_ns: int, trajectory: Trajectory) -> None:
         """All poses of a trajectory as nav_msgs/Path."""
-        self._write(
-            topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns)
-        )
+        self._write(topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns))
 
     def camera_info(self, topic: str, stamp_ns: int, camera: Camera) -> None:
         """Intrinsics, in the camera's frame."""

@@ -28,9 +28,7 @@ def _records(msg: Any) -> NDArray[np.void]:
             raise FormatError(f"cloud field '{field.name}' has unknown datatype {field.datatype}")
         size = np.dtype(kind).itemsize * max(1, int(field.count))
         if field.offset + size > msg.point_step:
-            raise FormatError(
-                f"cloud field '{field.name}' lies beyond point_step {msg.point_step}; mend its driver"
-            )
+            raise FormatError(f"cloud field '{field.name}' lies beyond point_step {msg.point_step}; mend its driver")
         if field.name and field.name not in names:
             names.append(field.name)
             formats.append((order + kind, max(1, int(field.count))) if field.count > 1 else order + kind)
@@ -38,9 +36,7 @@ def _records(msg: Any) -> NDArray[np.void]:
     missing = [name for name in "xyz" if name not in names]
     if missing:
         raise FormatError(f"cloud has no field '{missing[0]}', only {names}; choose a topic with 3D points")
-    layout = np.dtype(
-        {"names": names, "formats": formats, "offsets": offsets, "itemsize": int(msg.point_step)}
-    )
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": int(msg.point_step)})
     height, width = int(msg.height), int(msg.width)
     row, row_step = width * layout.itemsize, int(msg.row_step)
     data = np.frombuffer(msg.data, dtype=np.uint8)
@@ -51,9 +47,7 @@ def _records(msg: Any) -> NDArray[np.void]:
             f"cloud of {width}x{height} points of {layout.itemsize} bytes with row_step {msg.row_step} "
             f"holds {data.size} bytes; mend the driver that wrote it"
         )
-    grid: NDArray[np.void] = np.ndarray(
-        (height, width), layout, buffer=data.data, strides=(row_step, layout.itemsize)
-    )
+    grid: NDArray[np.void] = np.ndarray((height, width), layout, buffer=data.data, strides=(row_step, layout.itemsize))
     return grid.reshape(-1)
 
 

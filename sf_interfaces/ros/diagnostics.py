@@ -125,17 +125,13 @@ class Health:
 class DiagnosticsPublisher:
     """Publishes a node's health on /diagnostics at 1 Hz; this is also the node's heartbeat."""
 
-    def __init__(
-        self, node: Node, health: Health, refresh: Callable[[], None], period_s: float = 1.0
-    ) -> None:
+    def __init__(self, node: Node, health: Health, refresh: Callable[[], None], period_s: float = 1.0) -> None:
         from diagnostic_msgs.msg import DiagnosticArray
 
         from sf_interfaces.ros.qos import qos_profile
 
         self._node, self._health, self._refresh = node, health, refresh
-        self._publisher = node.create_publisher(
-            DiagnosticArray, DIAGNOSTICS.name, qos_profile(DIAGNOSTICS.qos)
-        )
+        self._publisher = node.create_publisher(DiagnosticArray, DIAGNOSTICS.name, qos_profile(DIAGNOSTICS.qos))
         self._timer = node.create_timer(period_s, self.publish)
 
     def publish(self) -> None:

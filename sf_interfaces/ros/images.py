@@ -47,9 +47,7 @@ def _pixels(msg: Any, dtype: str, channels: int) -> NDArray[Any]:
     if height < 1 or width < 1:
         raise FormatError(f"image has size {width}x{height}; give images that hold pixels")
     if step < row:
-        raise FormatError(
-            f"{msg.encoding} image of width {width} has step {step}, needs {row}; mend its driver"
-        )
+        raise FormatError(f"{msg.encoding} image of width {width} has step {step}, needs {row}; mend its driver")
     needed = step * (height - 1) + row
     if data.size < needed:
         raise FormatError(
@@ -76,9 +74,7 @@ def decode_image(msg: Any) -> UInt8:
     """
     if msg.encoding not in _IMAGE:
         hint = "it is depth" if msg.encoding in _DEPTH else f"known: {', '.join(_IMAGE)}"
-        raise FormatError(
-            f"cannot read encoding '{msg.encoding}' as a picture ({hint}); choose another topic"
-        )
+        raise FormatError(f"cannot read encoding '{msg.encoding}' as a picture ({hint}); choose another topic")
     dtype, channels, conversion = _IMAGE[msg.encoding]
     pixels = _pixels(msg, dtype, channels)
     if dtype == "u2":
@@ -103,9 +99,7 @@ def decode_depth(msg: Any) -> DepthMap:
         FormatError: an encoding that is no depth, or a step or length that does not fit the size.
     """
     if msg.encoding not in _DEPTH:
-        raise FormatError(
-            f"cannot read encoding '{msg.encoding}' as depth (16UC1 mm or 32FC1 m); choose another topic"
-        )
+        raise FormatError(f"cannot read encoding '{msg.encoding}' as depth (16UC1 mm or 32FC1 m); choose another topic")
     pixels = _pixels(msg, _DEPTH[msg.encoding], 1)
     if pixels.dtype.kind == "u":
         z = pixels.astype(np.float32) * np.float32(1e-3)
@@ -142,9 +136,7 @@ def encode_image(make: Factory, image: UInt8, stamp_ns: int, frame_id: str) -> A
     return _image(make, image, "rgb8" if image.ndim == 3 else "mono8", stamp_ns, frame_id)
 
 
-def encode_depth(
-    make: Factory, depth: DepthMap, stamp_ns: int, frame_id: str, encoding: str = "32FC1"
-) -> Any:
+def encode_depth(make: Factory, depth: DepthMap, stamp_ns: int, frame_id: str, encoding: str = "32FC1") -> Any:
     """Depth -> Image of 32FC1 (m, NaN invalid) or 16UC1 (mm rounded, 0 invalid or beyond 65.534 m).
 
     Raises:

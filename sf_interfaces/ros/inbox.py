@@ -39,9 +39,7 @@ class Inbox:
             self._held[kind] = self._held.get(kind, 0) + 1
             self._changed.notify()
         if dropped is not None:
-            self._on_drop(
-                kind, dropped, f"{kind} dropped: the node is slower than its input, the latest wins"
-            )
+            self._on_drop(kind, dropped, f"{kind} dropped: the node is slower than its input, the latest wins")
 
     def end(self, *, discard: bool = False) -> None:
         """Mark the end: after what is queued, or (``discard``) at once."""

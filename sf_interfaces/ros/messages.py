@@ -91,8 +91,7 @@ def decode_camera_info(msg: Any, rectified: bool = False) -> tuple[Camera, Disto
     name, frame = "P" if rectified else "K", msg.header.frame_id
     if not p.any():
         raise CalibrationError(
-            f"camera_info of '{frame}' is uncalibrated ({name} is all zero); "
-            "calibrate the camera or give --calibration"
+            f"camera_info of '{frame}' is uncalibrated ({name} is all zero); calibrate the camera or give --calibration"
         )
     if abs(p[0, 1]) > 1e-9 * abs(p[0, 0]) or p[1, 0]:
         raise CalibrationError(f"camera_info of '{frame}' has a {name} with skew; rectify the images first")
@@ -114,9 +113,7 @@ def decode_camera_info(msg: Any, rectified: bool = False) -> tuple[Camera, Disto
     return camera, Distortion(msg.distortion_model, coefficients)
 
 
-def encode_camera_info(
-    make: Factory, camera: Camera, stamp_ns: int, distortion: Distortion | None = None
-) -> Any:
+def encode_camera_info(make: Factory, camera: Camera, stamp_ns: int, distortion: Distortion | None = None) -> Any:
     """Camera -> CameraInfo: cx, cy in ROS convention (- 0.5), R identity, P = [K | 0]."""
     K = camera.K
     K[:2, 2] -= 0.5
@@ -133,9 +130,7 @@ def encode_camera_info(
         p=np.hstack([K, np.zeros((3, 1))]).reshape(-1),
         binning_x=0,
         binning_y=0,
-        roi=make("sensor_msgs/msg/RegionOfInterest")(
-            x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        ),
+        roi=make("sensor_msgs/msg/RegionOfInterest")(x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
     )
 
 
@@ -145,9 +140,7 @@ def _pose(translation: Any, rotation: Any, what: str) -> Float64:
     if not (np.isfinite(t).all() and np.isfinite(q).all()):
         raise FormatError(f"{what} holds values that are not finite; mend the node that wrote it")
     if abs(np.linalg.norm(q) - 1.0) > 1e-2:
-        raise FormatError(
-            f"{what} has quaternion {q.tolist()}, not of unit length; mend the node that wrote it"
-        )
+        raise FormatError(f"{what} has quaternion {q.tolist()}, not of unit length; mend the node that wrote it")
     return se3.from_quaternion(t, q)
 
 

@@ -284,9 +284,7 @@ class BlockNode(LifecycleNode):
                 self.health.drop(f"{self.leader} announced by upstream but never received", lost)
                 self._end_input()
         self.health.value("queue", len(self._inbox))
-        self.health.value(
-            "stream", "finished" if self._finished else "running" if self._active else "inactive"
-        )
+        self.health.value("stream", "finished" if self._finished else "running" if self._active else "inactive")
         self.refresh()
 
     # ---- worker thread
@@ -329,9 +327,7 @@ class BlockNode(LifecycleNode):
 
     def _credit(self, stamp_ns: int) -> None:
         if self.options.source == "sensors":
-            self.output(topics.consumed(self.short)).publish(
-                messages.to_stamp(messages.rclpy_factory, stamp_ns)
-            )
+            self.output(topics.consumed(self.short)).publish(messages.to_stamp(messages.rclpy_factory, stamp_ns))
 
     def _publish_state(self, state: int, stamp_ns: int) -> None:
         topic = topics.stream(self.short)

@@ -45,9 +45,7 @@ def declare(node: Node, cls: type, prefix: str = "", defaults: dict[str, Any] | 
     """
     for f in fields(cls):
         default = (defaults or {}).get(f.name, f.default)
-        described = _descriptor(
-            f.metadata.get("help", ""), default, f.metadata.get("low"), f.metadata.get("high")
-        )
+        described = _descriptor(f.metadata.get("help", ""), default, f.metadata.get("low"), f.metadata.get("high"))
         value = list(default) if isinstance(default, tuple) else default
         try:
             node.declare_parameter(_name(prefix, f.name), value, described)

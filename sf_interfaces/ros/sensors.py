@@ -60,13 +60,9 @@ class SensorInputs:
         a = self.assembler
         match kind:
             case "image":
-                a.push_image(
-                    messages.to_ns(msg.header.stamp), messages.decode_image(msg), msg.header.frame_id
-                )
+                a.push_image(messages.to_ns(msg.header.stamp), messages.decode_image(msg), msg.header.frame_id)
             case "depth":
-                a.push_depth(
-                    messages.to_ns(msg.header.stamp), messages.decode_depth(msg), msg.header.frame_id
-                )
+                a.push_depth(messages.to_ns(msg.header.stamp), messages.decode_depth(msg), msg.header.frame_id)
             case "lidar":
                 a.push_cloud(messages.decode_cloud(msg))
             case "pose":

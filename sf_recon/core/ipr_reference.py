@@ -46,9 +46,7 @@ class Raster:
         return ~np.isfinite(self.depth)
 
 
-def rasterize_reference(
-    points: Float32, camera: Camera, T_camera_map: Float64, options: RasterOptions
-) -> Raster:
+def rasterize_reference(points: Float32, camera: Camera, T_camera_map: Float64, options: RasterOptions) -> Raster:
     """Draw points [N, 3] (map frame). Slow: one step of Python per covered pixel."""
     p, T = points.astype(np.float32), T_camera_map.astype(np.float32)
     with np.errstate(invalid="ignore"):
@@ -74,9 +72,7 @@ def rasterize_reference(
         ids = np.array([i for _, i in sorted(hits)[: options.k_ray]])
         step_ok = np.concatenate([[True], np.diff(z[ids]) < np.float32(options.layer_gap)])
         first = ids[np.cumprod(step_ok).astype(bool)]
-        q2 = ((column + 0.5 - u[first]) / half[first, 0]) ** 2 + (
-            (row + 0.5 - v[first]) / half[first, 1]
-        ) ** 2
+        q2 = ((column + 0.5 - u[first]) / half[first, 0]) ** 2 + ((row + 0.5 - v[first]) / half[first, 1]) ** 2
         w = np.exp(-q2 / options.sigma)
         position[row, column] = (w / w.sum()) @ xyz[first]
         depth[row, column] = position[row, column, 2]

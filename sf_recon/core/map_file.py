@@ -82,9 +82,7 @@ def restore(saved: SavedMap, points: NeuralPoints, field: ColorField) -> None:
         for i, level in enumerate(points.levels):
             level.restore(a[f"level{i}.points"], a[f"level{i}.colors"])
             field.features[i] = torch.from_numpy(a[f"level{i}.features"])
-        state = {
-            k.removeprefix("network."): torch.from_numpy(v) for k, v in a.items() if k.startswith("network.")
-        }
+        state = {k.removeprefix("network."): torch.from_numpy(v) for k, v in a.items() if k.startswith("network.")}
         field.network.load_state_dict(state)
     except (KeyError, RuntimeError, TypeError) as error:
         raise FormatError(f"the map file lacks data or has arrays of the wrong shape: {error}") from error

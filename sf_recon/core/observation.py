@@ -46,9 +46,7 @@ def observe(keyframe: Keyframe, config: ReconConfig) -> Observation:
     """
     depth, camera = keyframe.depth, keyframe.camera
     if depth is None:
-        raise FormatError(
-            f"keyframe at {keyframe.stamp_ns} ns has no depth; put a depth block before reconstruction"
-        )
+        raise FormatError(f"keyframe at {keyframe.stamp_ns} ns has no depth; put a depth block before reconstruction")
     if depth.z.shape != (camera.height, camera.width):
         raise FormatError(
             f"keyframe at {keyframe.stamp_ns} ns: depth is {depth.z.shape[1]}x{depth.z.shape[0]} but the "

@@ -166,12 +166,8 @@ class Reconstruction:
 
     def _training_view(self, seen: Observation) -> TrainingView:
         count = min(self.config.keyframe_pixels, len(seen.points))
-        kept = (
-            np.sort(self._rng.choice(len(seen.points), count, replace=False)) if count else np.zeros(0, int)
-        )
-        return TrainingView(
-            seen.points[kept], _to_uint8(seen.colors[kept]), seen.weights[kept].astype(np.float16)
-        )
+        kept = np.sort(self._rng.choice(len(seen.points), count, replace=False)) if count else np.zeros(0, int)
+        return TrainingView(seen.points[kept], _to_uint8(seen.colors[kept]), seen.weights[kept].astype(np.float16))
 
     def _colored(self, points: Float32) -> PointCloud:
         return PointCloud(points, _to_uint8(self._field.color(points)), frame_id="map")

@@ -96,9 +96,7 @@ class Trainer:
         self.iteration = 0
         self.losses: list[float] = []
         self._rows = [RowAdam(f.shape[1]) for f in field.features]
-        self._network = torch.optim.Adam(
-            field.network.parameters(), lr=network_rate, betas=BETAS, eps=EPSILON
-        )
+        self._network = torch.optim.Adam(field.network.parameters(), lr=network_rate, betas=BETAS, eps=EPSILON)
 
     def add(self, view: TrainingView) -> None:
         """Take a new keyframe into the rotation."""

@@ -48,9 +48,7 @@ def project_jacobian(camera: Camera, points: Float64) -> Float64:
     return np.stack([u, v], axis=1)
 
 
-def residuals(
-    camera: Camera, T_cw: Float64, edges: Edges
-) -> tuple[Float64, Float64, Float64, NDArray[np.bool_]]:
+def residuals(camera: Camera, T_cw: Float64, edges: Edges) -> tuple[Float64, Float64, Float64, NDArray[np.bool_]]:
     """Residual [E, 2] px, points in the target [E, 3] m, T_target_source [E, 4, 4] and validity [E]."""
     T_ts = T_cw[edges.target] @ se3.inverse(T_cw[edges.source])
     points = np.einsum("eij,ej->ei", T_ts[:, :3, :3], edges.points) + T_ts[:, :3, 3]

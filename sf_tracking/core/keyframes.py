@@ -22,9 +22,7 @@ class TrackedKeyframe:
     gray: UInt8
     patches: Patches
     T_cw: Float64  # world to camera
-    observed: list[tuple[int, Edges]] = field(
-        default_factory=list
-    )  # (stamp of the source keyframe, its edges)
+    observed: list[tuple[int, Edges]] = field(default_factory=list)  # (stamp of the source keyframe, its edges)
 
     @property
     def camera(self) -> Camera:
@@ -39,9 +37,7 @@ class TrackedKeyframe:
         depth: DepthMap | None = frame.depth
         if frame.sparse_depth is not None:
             depth = frame.sparse_depth.to_map(camera.height, camera.width)
-        landmarks = PointCloud(
-            self.patches.points.astype(np.float32), None, None, frame.stamp_ns, camera.frame_id
-        )
+        landmarks = PointCloud(self.patches.points.astype(np.float32), None, None, frame.stamp_ns, camera.frame_id)
         return Keyframe(frame.stamp_ns, camera, frame.image, se3.inverse(self.T_cw), depth, landmarks)
 
 

@@ -61,9 +61,7 @@ def _measured(frame: Frame, camera: Camera) -> tuple[SparseDepth, Float32]:
         return frame.sparse_depth, frame.sparse_depth.to_map(camera.height, camera.width).z
     if frame.depth is not None:
         return SparseDepth.from_map(frame.depth), np.where(frame.depth.valid, frame.depth.z, np.nan)
-    return SparseDepth(np.zeros((0, 2)), np.zeros(0)), np.full(
-        (camera.height, camera.width), np.nan, np.float32
-    )
+    return SparseDepth(np.zeros((0, 2)), np.zeros(0)), np.full((camera.height, camera.width), np.nan, np.float32)
 
 
 def _spread(score: Float64, uv: Float64, camera: Camera, count: int) -> NDArray[np.int64]:
@@ -92,9 +90,7 @@ def extract(frame: Frame, gray: UInt8, config: TrackingConfig) -> Patches:
     candidates, z_map = _measured(frame, camera)
     col, row = np.floor(candidates.uv).astype(np.int64).T
     border = config.patch_px // 2 + 1
-    inside = (
-        (col >= border) & (col < camera.width - border) & (row >= border) & (row < camera.height - border)
-    )
+    inside = (col >= border) & (col < camera.width - border) & (row >= border) & (row < camera.height - border)
     col, row, uv, z = col[inside], row[inside], candidates.uv[inside], candidates.z[inside]
     steady = _continuous_depth(z_map, config.depth_gap)
     score = corner[row, col].astype(np.float64)

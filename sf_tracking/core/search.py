@@ -51,9 +51,7 @@ def _described(orb: cv2.ORB, keyframe: TrackedKeyframe) -> tuple[list[int], np.n
     uv = keyframe.patches.uv - 0.5
     points = [cv2.KeyPoint(float(u), float(v), 31.0, -1.0, 0.0, 0, i) for i, (u, v) in enumerate(uv)]
     angled = orb.detect(keyframe.gray, None)
-    if (
-        angled
-    ):  # a patch takes the orientation of the nearest corner, so that rotation does not break matching
+    if angled:  # a patch takes the orientation of the nearest corner, so that rotation does not break matching
         spots = np.array([k.pt for k in angled])
         for point in points:
             point.angle = angled[int(np.argmin(np.abs(spots - point.pt).sum(axis=1)))].angle

@@ -53,16 +53,12 @@ class Tracker:
     frames and configuration give the same poses.
     """
 
-    def __init__(
-        self, config: TrackingConfig = TrackingConfig(), operator: UpdateOperator | None = None
-    ) -> None:
+    def __init__(self, config: TrackingConfig, operator: UpdateOperator | None = None) -> None:
         self._config = config
         self._operator: UpdateOperator = operator or PatchAlignment(config)
         self._window: list[TrackedKeyframe] = []
         self._final: dict[int, Float64] = {}  # stamp of keyframe -> T_map_camera
-        self._relative: dict[
-            int, tuple[int, Float64]
-        ] = {}  # stamp -> (stamp of its keyframe, T_keyframe_frame)
+        self._relative: dict[int, tuple[int, Float64]] = {}  # stamp -> (stamp of its keyframe, T_keyframe_frame)
         self._recent: list[tuple[int, Float64]] = []  # the last two (stamp, T_cw), for the motion model
         self.state = TrackingState.INITIALISING
 
@@ -86,9 +82,7 @@ class Tracker:
         finished = self._remember(frame, gray, camera, T_cw, edges)
         T_map_camera = self._pose_of(frame.stamp_ns)
         self._recent = [*self._recent, (frame.stamp_ns, se3.inverse(T_map_camera))][-2:]
-        return TrackingUpdate(
-            frame.stamp_ns, T_map_camera, self.state, finished, edges=len(edges), inliers=inliers
-        )
+        return TrackingUpdate(frame.stamp_ns, T_map_camera, self.state, finished, edges=len(edges), inliers=inliers)
 
     def finish(self) -> TrackingUpdate:
         """End of the input: every keyframe still in the window becomes final."""
@@ -111,9 +105,7 @@ class Tracker:
         if frame.image is None or frame.camera is None:
             raise FormatError("tracking needs an image and its camera_info in every frame")
         if self._recent and frame.stamp_ns <= self._recent[-1][0]:
-            raise FormatError(
-                f"frame stamp {frame.stamp_ns} does not increase; reset the tracker on a time jump"
-            )
+            raise FormatError(f"frame stamp {frame.stamp_ns} does not increase; reset the tracker on a time jump")
         if self._window and frame.camera != self._window[-1].camera:
             raise FormatError("the camera changed within the sequence; start a new run for another camera")
         return frame.camera
@@ -141,9 +133,7 @@ class Tracker:
     def _locate(self, frame: Frame, gray: UInt8, camera: Camera) -> tuple[Float64 | None, Edges, int]:
         """Pose from the prediction; failing that with the full search range; failing that by descriptors."""
         known = len(self._recent) == 2
-        attempts = ([(self._predict(frame.stamp_ns), False)] if known else []) + [
-            (self._predict(frame.stamp_ns), True)
-        ]
+        attempts = ([(self._predict(frame.stamp_ns), False)] if known else []) + [(self._predict(frame.stamp_ns), True)]
         edges = Edges.concatenate([])
         for start, wide in attempts:
             T_cw, edges, inliers = self._align(gray, camera, start, wide)
@@ -155,9 +145,7 @@ class Tracker:
             return T_cw, edges, inliers
         return None, edges, 0
 
-    def _align(
-        self, gray: UInt8, camera: Camera, T_cw: Float64, wide: bool
-    ) -> tuple[Float64 | None, Edges, int]:
+    def _align(self, gray: UInt8, camera: Camera, T_cw: Float64, wide: bool) -> tuple[Float64 | None, Edges, int]:
         """Edges of all recent patches to the image and the pose they agree on (None: too few agree)."""
         sources = self._window[-self._config.lifetime :]
         for repeat in range(3 if wide else 1):
@@ -173,9 +161,7 @@ class Tracker:
         enough = inliers >= self._config.min_inliers and inliers > 0.3 * len(edges)
         return (T_cw if enough else None), edges, inliers
 
-    def _edges(
-        self, sources: list[TrackedKeyframe], gray: UInt8, camera: Camera, T_cw: Float64, wide: bool
-    ) -> Edges:
+    def _edges(self, sources: list[TrackedKeyframe], gray: UInt8, camera: Camera, T_cw: Float64, wide: bool) -> Edges:
         """One edge per patch that the update operator finds; poses are numbered as ``sources``, then the image."""
         parts = []
         for index, keyframe in enumerate(sources):
@@ -188,9 +174,7 @@ class Tracker:
             parts.append(Edges(*ends, keyframe.patches.points[ok], update.target[ok], update.information[ok]))
         return Edges.concatenate(parts)
 
-    def _remember(
-        self, frame: Frame, gray: UInt8, camera: Camera, T_cw: Float64, edges: Edges
-    ) -> tuple[Keyframe, ...]:
+    def _remember(self, frame: Frame, gray: UInt8, camera: Camera, T_cw: Float64, edges: Edges) -> tuple[Keyframe, ...]:
         """Store the frame relative to the newest keyframe, or make it a keyframe and optimise the window."""
         newest = self._window[-1]
         sources = self._window[-self._config.lifetime :]
@@ -207,13 +191,9 @@ class Tracker:
         keyframe = TrackedKeyframe(frame, gray, patches, T_cw)
         for index, source in enumerate(sources):
             mine = edges.source == index
-            part = Edges(
-                *(getattr(edges, name)[mine] for name in ("source", "target", "points", "uv", "information"))
-            )
+            part = Edges(*(getattr(edges, name)[mine] for name in ("source", "target", "points", "uv", "information")))
             keyframe.observed.append((source.frame.stamp_ns, part))
-            source.observed.append(
-                (frame.stamp_ns, self._edges([keyframe], source.gray, camera, source.T_cw, False))
-            )
+            source.observed.append((frame.stamp_ns, self._edges([keyframe], source.gray, camera, source.T_cw, False)))
         self._window.append(keyframe)
         self._optimise(camera)
         return (self._retire(),) if len(self._window) > self._config.window else ()

@@ -35,9 +35,7 @@ class UpdateOperator(Protocol):
         """Prepare an image [H, W] once for all its edges."""
         ...
 
-    def __call__(
-        self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool
-    ) -> Update:
+    def __call__(self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool) -> Update:
         """Align ``patches`` of ``source`` in ``target``, starting from ``start`` [M, 2] px.
 
         ``wide`` asks for the full search range because the motion is not known.
@@ -80,9 +78,7 @@ class PatchAlignment:
         # OpenCV leaves position and error undefined where it found nothing.
         return np.where(ok[:, None], found, points), ok, np.where(ok, error.ravel(), 0.0)
 
-    def __call__(
-        self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool
-    ) -> Update:
+    def __call__(self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool) -> Update:
         """See :class:`UpdateOperator`."""
         c = self._config
         count = len(patches)

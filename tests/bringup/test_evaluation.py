@@ -33,9 +33,7 @@ def disturbed(reference: Trajectory, seed: int, scale: float, kind: Scale) -> Tr
 
 
 def as_evo(trajectory: Trajectory) -> PoseTrajectory3D:
-    return PoseTrajectory3D(
-        poses_se3=[np.array(T) for T in trajectory.poses], timestamps=trajectory.stamps_ns * 1e-9
-    )
+    return PoseTrajectory3D(poses_se3=[np.array(T) for T in trajectory.poses], timestamps=trajectory.stamps_ns * 1e-9)
 
 
 @pytest.mark.parametrize("kind, scale", [(Scale.METRIC, 1.0), (Scale.ARBITRARY, 0.37)])

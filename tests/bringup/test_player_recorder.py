@@ -157,9 +157,7 @@ def test_lossless_play_waits_for_credits(sample: Path) -> None:
         until = time.monotonic() + 30
         while player.poll() is None and time.monotonic() < until:
             executor.spin_once(timeout_sec=0.02)
-            while (
-                len(waiting) > most and executor.spin_once(timeout_sec=0.02) is None and len(waiting) > most
-            ):
+            while len(waiting) > most and executor.spin_once(timeout_sec=0.02) is None and len(waiting) > most:
                 most = len(waiting)
             if waiting:
                 time.sleep(0.02)

@@ -37,9 +37,7 @@ def test_fronto_parallel_plane_is_white_with_a_black_border(variant: str, step: 
 @settings(max_examples=20, deadline=None)
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))
 def test_every_plane_is_white_in_the_normalized_form(slope_x: float, slope_y: float) -> None:
-    image = flexion_image(
-        plane(CAMERA, slope_x, slope_y), CAMERA, FlexionConfig("normalized", step=2, median=1)
-    )
+    image = flexion_image(plane(CAMERA, slope_x, slope_y), CAMERA, FlexionConfig("normalized", step=2, median=1))
     assert (inner(image, 2) >= 253).all()
 
 
@@ -55,9 +53,7 @@ def test_standard_form_darkens_with_slant() -> None:
     ("sigma_mm", "step", "expected", "tolerance"),
     [(1, 1, 0.94, 0.03), (1, 2, 0.98, 0.02), (5, 1, 0.48, 0.05), (5, 2, 0.73, 0.05), (5, 4, 0.91, 0.03)],
 )
-def test_noise_on_a_plane_at_two_metres(
-    sigma_mm: float, step: int, expected: float, tolerance: float
-) -> None:
+def test_noise_on_a_plane_at_two_metres(sigma_mm: float, step: int, expected: float, tolerance: float) -> None:
     camera = Camera(320, 240, 600.0, 600.0, 160.0, 120.0)
     noise = np.random.default_rng(7).normal(0, sigma_mm * 1e-3, (240, 320))
     image = flexion_image(DepthMap(2.0 + noise), camera, FlexionConfig(step=step, median=1))

@@ -64,9 +64,7 @@ def test_inverse(T: np.ndarray) -> None:
 def test_composition_is_associative_and_acts_on_points(A: np.ndarray, B: np.ndarray, C: np.ndarray) -> None:
     np.testing.assert_allclose((A @ B) @ C, A @ (B @ C), atol=1e-9)
     points = np.array([[1.0, -2.0, 3.0], [0.0, 0.0, 0.0]])
-    np.testing.assert_allclose(
-        se3.transform(A @ B, points), se3.transform(A, se3.transform(B, points)), atol=1e-9
-    )
+    np.testing.assert_allclose(se3.transform(A @ B, points), se3.transform(A, se3.transform(B, points)), atol=1e-9)
 
 
 @given(motions, twists())
@@ -122,9 +120,7 @@ def test_a_scaled_camera_sees_the_same_rays(camera: Camera, factor: float) -> No
     small = camera.scaled(factor)
     ratio = np.array([small.width / camera.width, small.height / camera.height])
     point = np.array([0.3, -0.2, 1.7])
-    np.testing.assert_allclose(
-        small.project(point)[0], camera.project(point)[0] * ratio, rtol=1e-9, atol=1e-9
-    )
+    np.testing.assert_allclose(small.project(point)[0], camera.project(point)[0] * ratio, rtol=1e-9, atol=1e-9)
 
 
 def test_pixel_centres_lie_at_half_integers_and_K_projects() -> None:

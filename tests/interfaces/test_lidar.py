@@ -31,8 +31,7 @@ def test_static_scene_deskews_to_the_truth(twist: tuple[float, ...], reference_n
     xi = np.array(twist)
     T_world_lidar = se3.exp(offsets[:, None] * 1e-9 * xi)
     scanned = (
-        np.einsum("nij,nj->ni", se3.inverse(T_world_lidar)[:, :3, :3], truth)
-        + se3.inverse(T_world_lidar)[:, :3, 3]
+        np.einsum("nij,nj->ni", se3.inverse(T_world_lidar)[:, :3, :3], truth) + se3.inverse(T_world_lidar)[:, :3, 3]
     )
     expected = se3.transform(se3.inverse(se3.exp(reference_ns * 1e-9 * xi)), truth)
     np.testing.assert_allclose(deskew(scanned, offsets, xi, reference_ns), expected, atol=1e-6)

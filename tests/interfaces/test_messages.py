@@ -53,9 +53,7 @@ shapes = st.tuples(st.integers(1, 9), st.integers(1, 9))
 
 
 @settings(max_examples=30, deadline=None)
-@given(
-    image=shapes.flatmap(lambda s: st.sampled_from([s, (*s, 3)])).flatmap(lambda s: hnp.arrays(np.uint8, s))
-)
+@given(image=shapes.flatmap(lambda s: st.sampled_from([s, (*s, 3)])).flatmap(lambda s: hnp.arrays(np.uint8, s)))
 def test_image_round_trip(image: np.ndarray) -> None:
     for factory in (make, rclpy_make):
         msg = through_wire(m.encode_image(factory, image, STAMP, "cam"), "sensor_msgs/msg/Image")
@@ -92,9 +90,7 @@ def raw_image(pixels: np.ndarray, encoding: str, pad: int = 0, big: bool = False
     rows = stored.reshape(len(stored), -1).view(np.uint8)
     rows = np.pad(rows, ((0, 0), (0, pad)), constant_values=7)
     msg = m.encode_image(make, np.zeros(pixels.shape[:2], np.uint8), STAMP, "cam")
-    return dataclasses.replace(
-        msg, encoding=encoding, is_bigendian=int(big), step=rows.shape[1], data=rows.reshape(-1)
-    )
+    return dataclasses.replace(msg, encoding=encoding, is_bigendian=int(big), step=rows.shape[1], data=rows.reshape(-1))
 
 
 @pytest.mark.parametrize("pad", [0, 5])
@@ -224,9 +220,7 @@ def test_zero_distortion_is_identity() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    points=hnp.arrays(
-        np.float32, st.tuples(st.integers(0, 20), st.just(3)), elements=st.floats(-1e3, 1e3, width=32)
-    ),
+    points=hnp.arrays(np.float32, st.tuples(st.integers(0, 20), st.just(3)), elements=st.floats(-1e3, 1e3, width=32)),
     colored=st.booleans(),
     timed=st.booleans(),
 )

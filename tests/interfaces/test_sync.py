@@ -34,8 +34,7 @@ def _streams(stamps: dict[str, list[int]]) -> dict[str, list]:
     return {
         "image": [lambda a, t=t: a.push_image(t, _image(t // MS), "cam") for t in stamps["image"]],
         "depth": [
-            lambda a, t=t: a.push_depth(t, DepthMap(np.full((24, 32), 1 + t / 1e9)), "cam")
-            for t in stamps["depth"]
+            lambda a, t=t: a.push_depth(t, DepthMap(np.full((24, 32), 1 + t / 1e9)), "cam") for t in stamps["depth"]
         ],
         "lidar": [lambda a, t=t: a.push_cloud(_cloud(t, t // MS)) for t in stamps["lidar"]],
         "pose": [lambda a, t=t, i=i: a.push_pose(t, motion[i]) for i, t in enumerate(stamps["pose"])],
@@ -89,9 +88,7 @@ def _case(draw: st.DrawFn) -> tuple[SyncConfig, list, list]:
         return out + [s * MS for s in stamps] if jump else out
 
     jump = draw(st.booleans())
-    stamps = {
-        name: times(0 if name != "image" else 1, 8, jump) for name in ("image", "depth", "lidar", "pose")
-    }
+    stamps = {name: times(0 if name != "image" else 1, 8, jump) for name in ("image", "depth", "lidar", "pose")}
     config = SyncConfig(
         depth=draw(st.booleans()), lidar=draw(st.booleans()), pose=draw(st.booleans()), depth_slop_s=0.03
     )
