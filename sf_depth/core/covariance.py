@@ -47,7 +47,10 @@ class StructureCovariance:
         smooth = cv2.GaussianBlur(image.astype(np.float32) / 255.0, (0, 0), 1.0)
         feature = smooth.reshape(*image.shape[:2], -1)
         grey = feature.mean(axis=2)
-        gx, gy = cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125)
+        gx, gy = (
+            cv2.Sobel(grey, cv2.CV_32F, 1, 0, scale=0.125),
+            cv2.Sobel(grey, cv2.CV_32F, 0, 1, scale=0.125),
+        )
         products = cv2.GaussianBlur(np.stack([gx * gx, gx * gy, gy * gy], axis=-1), (0, 0), 2.0)
         gain = self.edge_strength * (length_px / self.color_scale) ** 2
         xx, xy, yy = 1.0 + gain * products[..., 0], gain * products[..., 1], 1.0 + gain * products[..., 2]
@@ -75,5 +78,6 @@ def kernel(
     det1 = (E1[..., 0] * E1[..., 2] - E1[..., 1] ** 2)[:, :, None]
     det2 = (E2[..., 0] * E2[..., 2] - E2[..., 1] ** 2)[:, None]
     norm = 2.0 * (det1 * det2) ** 0.25 / torch.sqrt(det)
-    color = torch.cdist(c1, c2, compute_mode="donot_use_mm_for_euclid_dist") ** 2
+    squares = (c1 * c1).sum(dim=2)[:, :, None] + (c2 * c2).sum(dim=2)[:, None]
+    color = (squares - 2.0 * c1 @ c2.transpose(1, 2)).clamp_min(0.0)
     return norm * (1.0 + r) * torch.exp(-r - 0.5 * color)
