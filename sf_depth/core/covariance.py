@@ -1,7 +1,7 @@
-"""The covariance function of depth completion (paper Sec. ScaleCov, eq. of k; DepthCov's non-stationary Matern).
+"""The covariance function of depth completion (paper Sec. ScaleCov): a non-stationary Matern kernel.
 
-A model gives every pixel a 2x2 covariance E, the shape of its neighbourhood, and a feature. The default needs no
-training: correlation shortens across image edges, and colours that differ do not belong together.
+A model gives every pixel a 2x2 covariance E, the shape of its neighbourhood, and a feature. The default needs
+no training: correlation shortens across image edges, and colours that differ do not belong together.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -21,7 +21,7 @@ _JITTER = 1e-8  # under the root, so that the kernel is smooth at zero distance
 
 @dataclass(frozen=True, slots=True)
 class PixelCovariance:
-    """Neighbourhood shapes E [H, W, 3] (xx, xy, yy) in px^2 and features [H, W, C] in units of their own scale."""
+    """Neighbourhood shapes E [H, W, 3] (xx, xy, yy) px^2 and features [H, W, C], unit scale."""
 
     shape: Float32
     feature: Float32
