@@ -12,13 +12,13 @@ from sf_interfaces.config import option
 class DepthConfig:
     """How sparse depth becomes dense depth with variance (paper Sec. ScaleCov)."""
 
-    neighbours: int = option(24, "observations each tile of pixels is conditioned on", low=4, high=128)
-    tile: int = option(4, "side in px of the tiles that share their observations", low=1, high=32)
+    neighbours: int = option(16, "observations each tile of pixels is conditioned on", low=4, high=128)
+    tile: int = option(8, "side in px of the tiles that share their observations", low=1, high=32)
     length_scale: float = option(
         0.0, "correlation length in mean point spacings; 0 = most likely one per image", low=0.0, high=64.0
     )
     color_scale: float = option(
-        0.15, "colour difference (0..1) over which correlation falls to 0.6", low=0.01, high=10.0
+        0.08, "colour difference (0..1) over which correlation falls to 0.6", low=0.01, high=10.0
     )
     edge_strength: float = option(
         1.0, "how much correlation shortens across image edges; 0 = not at all", low=0.0, high=100.0

@@ -1,7 +1,7 @@
-"""The covariance function of depth completion (paper Sec. ScaleCov, eq. of k; DepthCov's non-stationary Matern).
+"""The covariance function of depth completion (paper Sec. ScaleCov): a non-stationary Matern kernel.
 
-A model gives every pixel a 2x2 covariance E, the shape of its neighbourhood, and a feature. The default needs no
-training: correlation shortens across image edges, and colours that differ do not belong together.
+A model gives every pixel a 2x2 covariance E, the shape of its neighbourhood, and a feature. The default needs
+no training: correlation shortens across image edges, and colours that differ do not belong together.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -21,7 +21,7 @@ _JITTER = 1e-8  # under the root, so that the kernel is smooth at zero distance
 
 @dataclass(frozen=True, slots=True)
 class PixelCovariance:
-    """Neighbourhood shapes E [H, W, 3] (xx, xy, yy) in px^2 and features [H, W, C] in units of their own scale."""
+    """Neighbourhood shapes E [H, W, 3] (xx, xy, yy) px^2 and features [H, W, C], unit scale."""
 
     shape: Float32
     feature: Float32
@@ -78,5 +78,6 @@ def kernel(
     det1 = (E1[..., 0] * E1[..., 2] - E1[..., 1] ** 2)[:, :, None]
     det2 = (E2[..., 0] * E2[..., 2] - E2[..., 1] ** 2)[:, None]
     norm = 2.0 * (det1 * det2) ** 0.25 / torch.sqrt(det)
-    color = torch.cdist(c1, c2, compute_mode="donot_use_mm_for_euclid_dist") ** 2
+    squares = (c1 * c1).sum(dim=2)[:, :, None] + (c2 * c2).sum(dim=2)[:, None]
+    color = (squares - 2.0 * c1 @ c2.transpose(1, 2)).clamp_min(0.0)
     return norm * (1.0 + r) * torch.exp(-r - 0.5 * color)

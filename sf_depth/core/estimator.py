@@ -85,7 +85,9 @@ class DepthCompleter:
         padded = np.ones((grid_rows * size, grid_cols * size), dtype=bool)
         padded[:height, :width] = depth.valid
         corner = size * np.argwhere(~padded.reshape(grid_rows, size, grid_cols, size).all(axis=(1, 3)))
-        inside = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1).reshape(
+            -1, 2
+        )
         z, variance = (np.full((height, width), np.nan, dtype=np.float32) for _ in range(2))
         for part in gp.chunks(len(corner)):
             query = np.minimum(corner[part, None] + inside, (height - 1, width - 1))
@@ -120,7 +122,8 @@ class DepthCompleter:
             error, unit_variance = gp.leave_one_out(tiles)
             variance = gp.amplitudes(tiles, typical) * unit_variance
             normalised = error**2 / variance
-            inflation = max(float(torch.quantile(normalised, 0.683)), 1e-3)  # 68 % within one sigma
+            one, two = torch.quantile(normalised, torch.tensor([0.683, 0.954])).tolist()
+            inflation = max(one, two / 4.0, 1e-3)  # 68 % within one sigma and 95 % within two
             cost = float((torch.log(inflation * variance) + torch.log1p(normalised / inflation)).mean())
             if best is None or cost < best[0]:
                 best = cost, Hyperparameters(length * spacing, typical, inflation), pixels

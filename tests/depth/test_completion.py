@@ -1,0 +1,108 @@
+"""Completion is exact on planes, honest about its error, sharp at image edges, deterministic, and keeps measurements."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from sf_depth.config import DepthConfig
+from sf_depth.core.covariance import StructureCovariance, kernel
+from sf_depth.core.estimator import DepthCompleter
+from sf_interfaces.errors import FormatError, SceneFactoryError
+from sf_interfaces.types import Camera, DepthMap, Keyframe
+
+CAMERA = Camera(160, 120, 150.0, 150.0, 80.0, 60.0)
+
+
+def keyframe(truth: np.ndarray, image: np.ndarray, fraction: float = 0.05, seed: int = 0) -> Keyframe:
+    kept = np.random.default_rng(seed).random(truth.shape) < fraction
+    return Keyframe(0, CAMERA, image, np.eye(4), DepthMap(np.where(kept, truth, np.nan)))
+
+
+def slanted() -> np.ndarray:
+    rays = CAMERA.unproject(CAMERA.pixel_grid(), np.ones((120, 160)))
+    return 5.0 / (rays @ np.array([0.5, 0.8, 1.0]))
+
+
+def completed(given: Keyframe, **options: float) -> DepthMap:
+    depth = DepthCompleter(DepthConfig(**options)).complete(given).depth
+    assert depth is not None and depth.variance is not None
+    return depth
+
+
+GREY = np.full((120, 160), 128, np.uint8)
+
+
+def test_a_plane_is_recovered_at_any_slant() -> None:
+    truth = slanted()
+    error = np.abs(completed(keyframe(truth, GREY)).z / truth - 1)
+    assert np.median(error) < 1e-3 and error.max() < 0.02
+
+
+def test_measurements_stay_and_carry_the_sensor_variance() -> None:
+    given = keyframe(slanted(), GREY)
+    depth = completed(given, depth_sigma=0.05)
+    seen = given.depth.valid
+    np.testing.assert_array_equal(depth.z[seen], given.depth.z[seen])
+    np.testing.assert_allclose(depth.variance[seen], 0.05**2, rtol=1e-5)
+    assert depth.density == 1.0 and (depth.variance[~seen] >= 0.05**2 * 0.999).all()
+
+
+def test_foreground_does_not_bleed_over_an_image_edge() -> None:
+    truth, image = np.full((120, 160), 10.0), np.full((120, 160, 3), 40, np.uint8)
+    truth[30:90, 50:110], image[30:90, 50:110] = 4.0, 200
+    given = keyframe(truth, image)
+    with_edges = np.abs(completed(given).z - truth)
+    without = np.abs(completed(replace(given, image=np.full_like(image, 90))).z - truth)
+    assert with_edges.mean() < 0.3 * without.mean()
+
+
+def test_variance_grows_away_from_support_and_can_be_cut() -> None:
+    given = keyframe(slanted() + 0.02 * np.random.default_rng(1).standard_normal((120, 160)), GREY)
+    z = given.depth.z.copy()
+    z[:60] = np.nan
+    given = replace(given, depth=DepthMap(z))
+    depth = completed(given)
+    assert np.median(depth.variance[:20]) > 10 * np.median(depth.variance[70:])
+    cut = completed(given, max_sigma=float(np.sqrt(np.median(depth.variance[50]))))
+    assert np.isnan(cut.z[:10]).mean() > 0.9 and np.isfinite(cut.z[70:]).mean() > 0.9
+
+
+def test_variance_is_calibrated_on_a_rough_surface() -> None:
+    row, col = np.mgrid[:120, :160]
+    truth = 5 + 0.5 * np.sin(row / 9.0) * np.cos(col / 11.0)
+    given = keyframe(truth + 0.02 * np.random.default_rng(2).standard_normal(truth.shape), GREY)
+    depth = completed(given, depth_sigma=0.02)
+    hidden = ~given.depth.valid
+    normalised = np.abs(depth.z - truth)[hidden] / np.sqrt(depth.variance[hidden])
+    assert (normalised < 1).mean() > 0.6 and (normalised < 2).mean() > 0.9
+
+
+def test_completion_is_deterministic() -> None:
+    given = keyframe(slanted(), GREY)
+    first, second = completed(given), completed(given)
+    np.testing.assert_array_equal(first.z, second.z)
+    np.testing.assert_array_equal(first.variance, second.variance)
+
+
+def test_the_kernel_is_a_correlation() -> None:
+    rng = np.random.default_rng(3)
+    pixels = StructureCovariance(0.1, 1.0)(rng.integers(0, 255, (40, 40, 3), dtype=np.uint8), 6.0)
+    row, col = rng.integers(0, 40, (2, 30))
+    x = torch.tensor(np.stack([col, row], -1), dtype=torch.float32)[None]
+    E, c = torch.tensor(pixels.shape[row, col])[None], torch.tensor(pixels.feature[row, col])[None]
+    K = kernel(x, E, c, x, E, c)[0]
+    assert torch.allclose(K, K.T, atol=1e-5) and torch.allclose(K.diagonal(), torch.ones(30), atol=1e-3)
+    assert torch.linalg.eigvalsh(K.double()).min() > -1e-4
+
+
+def test_too_little_depth_is_refused() -> None:
+    given = keyframe(slanted(), GREY)
+    for depth in (None, DepthMap(np.full((120, 160), np.nan)), DepthMap(np.ones((5, 5)))):
+        with pytest.raises(FormatError) as error:
+            DepthCompleter(DepthConfig()).complete(replace(given, depth=depth))
+        assert isinstance(error.value, SceneFactoryError)
