@@ -140,10 +140,16 @@ class SceneBuilder:
         r, h = np.asarray(profile, dtype=float).T
         angle = np.linspace(0, 2 * np.pi, segments + 1)
         ring = np.stack([np.cos(angle) * squash[0], np.sin(angle) * squash[1]], -1)
-        p = np.concatenate([r[:, None, None] * ring, np.broadcast_to(h[:, None, None], (len(r), segments + 1, 1))], -1)
+        p = np.concatenate(
+            [r[:, None, None] * ring, np.broadcast_to(h[:, None, None], (len(r), segments + 1, 1))], -1
+        )
         slope_r, slope_h = np.gradient(r), np.gradient(h)
         n = np.concatenate(
-            [slope_h[:, None, None] * ring, np.broadcast_to(-slope_r[:, None, None], (len(r), segments + 1, 1))], -1
+            [
+                slope_h[:, None, None] * ring,
+                np.broadcast_to(-slope_r[:, None, None], (len(r), segments + 1, 1)),
+            ],
+            -1,
         )
         n /= np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-9)
         arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(r), np.diff(h)))]) / tile
@@ -163,10 +169,19 @@ class SceneBuilder:
     def cylinder(self, base: Vector, radius: float, height: float, texture: int, **look: object) -> None:
         """A closed upright cylinder on the centre of its base."""
         e = 1e-3 * radius
-        profile = ((0, 0), (radius - e, 0), (radius, e), (radius, height - e), (radius - e, height), (0, height))
+        profile = (
+            (0, 0),
+            (radius - e, 0),
+            (radius, e),
+            (radius, height - e),
+            (radius - e, height),
+            (0, height),
+        )
         self.lathe(base, profile, texture, **look)  # type: ignore[arg-type]
 
-    def sphere(self, centre: Vector, radius: float, texture: int, flatten: float = 1.0, **look: object) -> None:
+    def sphere(
+        self, centre: Vector, radius: float, texture: int, flatten: float = 1.0, **look: object
+    ) -> None:
         """A sphere, or an ellipsoid of vertical half axis ``radius * flatten``."""
         a = np.linspace(-np.pi / 2, np.pi / 2, 13)
         profile = list(zip(radius * np.cos(a), radius * flatten * np.sin(a), strict=True))

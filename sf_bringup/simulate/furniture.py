@@ -82,7 +82,13 @@ def sofa(b: SceneBuilder, length: float = 2.0, cloth: str = "fabric4") -> None:
         b.box((side * (length / 2 - 0.09), 0, 0.4), (0.18, 0.85, 0.22), body, 0.8)
         b.sphere((side * length * 0.28, -0.12, 0.56), 0.21, material(b, "fabric5"), 0.8, tile=0.5)
     for k in range(2):
-        b.box(((k - 0.5) * (length - 0.4) / 2, 0.06, 0.4), ((length - 0.42) / 2, 0.66, 0.1), body, 0.7, (0.9,) * 3)
+        b.box(
+            ((k - 0.5) * (length - 0.4) / 2, 0.06, 0.4),
+            ((length - 0.42) / 2, 0.66, 0.1),
+            body,
+            0.7,
+            (0.9,) * 3,
+        )
 
 
 def bed(b: SceneBuilder) -> None:
@@ -109,7 +115,9 @@ def shelf(b: SceneBuilder, width: float = 1.4, height: float = 2.0, boards: int 
         while x < width / 2 - 0.1:
             w, h = b.rng.uniform(0.025, 0.07), pitch * b.rng.uniform(0.55, 0.85)
             cover = material(b, f"painting{b.rng.integers(1, 7)}")
-            b.box((x + w / 2, 0, k * pitch + 0.03), (w * 0.93, 0.22, h), cover, 0.6, b.rng.uniform(0.5, 1.1, 3))
+            b.box(
+                (x + w / 2, 0, k * pitch + 0.03), (w * 0.93, 0.22, h), cover, 0.6, b.rng.uniform(0.5, 1.1, 3)
+            )
             x += w if b.rng.random() < 0.93 else 0.16
 
 
@@ -121,10 +129,17 @@ def cabinet(b: SceneBuilder, width: float = 1.2, height: float = 0.85, wood: str
     for k in range(doors):
         x = (k + 0.5) * width / doors - width / 2
         b.box((x, 0.232, 0.12), (width / doors - 0.05, 0.025, height - 0.2), grain, 0.8, (1.12, 1.08, 1.0))
-        b.sphere((x + 0.3 * width / doors, 0.26, height / 2), 0.02, material(b, "metal"), gloss=0.6, segments=10)
+        b.sphere(
+            (x + 0.3 * width / doors, 0.26, height / 2), 0.02, material(b, "metal"), gloss=0.6, segments=10
+        )
     if height < 1.2:
         b.box((-0.3 * width, 0, height), (0.2, 0.04, 0.26), material(b, "painting2"), None)
-        b.lathe((0.25 * width, 0, height), ((0.06, 0), (0.1, 0.12), (0.04, 0.24), (0.07, 0.3)), material(b, "fabric9"), 0.3)
+        b.lathe(
+            (0.25 * width, 0, height),
+            ((0.06, 0), (0.1, 0.12), (0.04, 0.24), (0.07, 0.3)),
+            material(b, "fabric9"),
+            0.3,
+        )
 
 
 def desk(b: SceneBuilder) -> None:
@@ -253,7 +268,13 @@ def building(b: SceneBuilder, sx: float, sy: float, height: float, index: int) -
     """A campus building: windowed facades, a roof with parapet, plant rooms and vents."""
     b.box((0, 0, 0), (sx, sy, height), material(b, f"facade{index}"), 12.0)
     b.box((0, 0, height), (sx + 0.6, sy + 0.6, 0.8), material(b, "concrete"), 5.0)
-    b.box((0, 0, height + 0.8), (sx - 0.6, sy - 0.6, 0.1), material(b, "gravel"), 6.0, b.rng.uniform(0.7, 1.1, 3))
+    b.box(
+        (0, 0, height + 0.8),
+        (sx - 0.6, sy - 0.6, 0.1),
+        material(b, "gravel"),
+        6.0,
+        b.rng.uniform(0.7, 1.1, 3),
+    )
     for _ in range(int(sx * sy / 90) + 2):
         x, y = b.rng.uniform(-0.4, 0.4, 2) * (sx, sy)
         w, d, h = b.rng.uniform(0.8, 3.5, 3)

@@ -34,7 +34,20 @@ class RoomPlan:
 _HOME = ("sofa", "plant", "shelf", "lamp", "cabinet", "window", "shelf", "plant")
 _BEDROOM = ("wardrobe", "window", "bed", "cabinet", "shelf", "plant", "lamp", "desk")
 _OFFICE = ("desk", "window", "desk", "shelf", "cabinet", "plant", "desk", "shelf", "door", "crates")
-_MIXED = ("sofa", "shelf", "window", "plant", "desk", "cabinet", "lamp", "shelf", "door", "sofa", "plant", "wardrobe")
+_MIXED = (
+    "sofa",
+    "shelf",
+    "window",
+    "plant",
+    "desk",
+    "cabinet",
+    "lamp",
+    "shelf",
+    "door",
+    "sofa",
+    "plant",
+    "wardrobe",
+)
 
 ROOMS: dict[str, RoomPlan] = {
     "room": RoomPlan((5.0, 5.0, 2.7), "plaster", "parquet", _HOME),
@@ -83,12 +96,19 @@ def _piece(b: SceneBuilder, name: str) -> None:
         with b.at(-0.4, -0.05):
             f.crates(b)
     else:
-        {"sofa": f.sofa, "plant": f.plant, "lamp": f.lamp, "shelf": f.shelf, "cabinet": f.cabinet, "door": f.door}[
-            name
-        ](b)
+        {
+            "sofa": f.sofa,
+            "plant": f.plant,
+            "lamp": f.lamp,
+            "shelf": f.shelf,
+            "cabinet": f.cabinet,
+            "door": f.door,
+        }[name](b)
 
 
-def _along_wall(b: SceneBuilder, length: float, distance: float, yaw: float, queue: list[str], index: int) -> None:
+def _along_wall(
+    b: SceneBuilder, length: float, distance: float, yaw: float, queue: list[str], index: int
+) -> None:
     """Fill one wall (its middle ``distance`` m from the origin) with pieces of the queue, pictures above."""
     place, used = [], 0.0
     while queue and used + _FOOTPRINT[queue[0]][0] < length - 1.3:

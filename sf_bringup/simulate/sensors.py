@@ -62,9 +62,7 @@ LIDARS = {
 }
 
 
-def ray_pattern(
-    model: LidarModel, sweep: int, period: float, fov_deg: float
-) -> tuple[Float64, Float64]:
+def ray_pattern(model: LidarModel, sweep: int, period: float, fov_deg: float) -> tuple[Float64, Float64]:
     """Unit directions [N, 3] (x forward, z up) and times [N] s after the start of sweep number ``sweep``."""
     if model.lines == 1:
         t = (np.arange(model.columns) + 0.5) / model.columns * period

@@ -37,7 +37,10 @@ def test_depth_and_poses_warp_one_image_onto_another(simulator: Simulator) -> No
     second, z1, T1 = simulator.frame(6)
     world = se3.transform(T0, camera.unproject(camera.pixel_grid(), z))
     uv, depth = camera.project(se3.transform(se3.inverse(T1), world))
-    col, row = np.floor(np.nan_to_num(uv)).astype(int)[..., 0], np.floor(np.nan_to_num(uv)).astype(int)[..., 1]
+    col, row = (
+        np.floor(np.nan_to_num(uv)).astype(int)[..., 0],
+        np.floor(np.nan_to_num(uv)).astype(int)[..., 1],
+    )
     inside = (col >= 0) & (col < camera.width) & (row >= 0) & (row < camera.height) & (depth > 0)
     seen = np.abs(z1[row[inside], col[inside]] - depth[inside]) < 0.03 * depth[inside]
     assert seen.mean() > 0.7
@@ -83,5 +86,5 @@ def test_bad_input_is_refused(tmp_path: Path) -> None:
 
 def test_small_house_loads(shared_data) -> None:  # type: ignore[no-untyped-def]
     scene = load_world(shared_data("mesh_small_house") / "worlds" / "small_house.world")
-    assert len(scene.corners) > 200_000
+    assert len(scene.corners) > 147_000  # 87 placed instances hold 147 684 faces, two of them degenerate
     assert np.abs(scene.corners[..., 0]).max() < 12
