@@ -90,7 +90,7 @@ class SceneBuilder:
         tint: Vector = (1, 1, 1),
         gloss: float = 0.1,
     ) -> None:
-        """A parallelogram; ``tile`` metres per texture repeat, or None to fit the texture once (v downwards)."""
+        """A parallelogram; ``tile`` metres per repeat, or None to fit the texture once (v downwards)."""
         o, a, b = (np.asarray(x, dtype=float) for x in (origin, along, up))
         p = np.stack([o, o + a, o + a + b, o + b])
         la, lb = np.linalg.norm(a), np.linalg.norm(b)

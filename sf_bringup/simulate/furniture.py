@@ -1,4 +1,4 @@
-"""Furniture, street furniture and plants: each function builds one piece about its own origin on the floor."""
+"""Furniture, street furniture and plants: each function builds one piece about its own origin."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The worlds: furnished rooms, a machine hall, a palace with its garden, and a campus. World frame: z up, m."""
+"""The worlds: furnished rooms, a machine hall, a palace with its garden, a campus. z up, m."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -20,8 +20,8 @@ class RoomPlan:
     """A rectangular room centred on the origin and what stands in it.
 
     Args:
-        size: x, y, z m; wall, floor: material names; pieces: furniture along the walls, in order round the room
-        starting at the -y wall; centre: what stands in the middle.
+        size: x, y, z m; wall, floor: material names; pieces: furniture along the walls,
+        in order round the room starting at the -y wall; centre: what stands in the middle.
     """
 
     size: tuple[float, float, float]

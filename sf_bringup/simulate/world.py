@@ -87,7 +87,8 @@ def _load_model(builder: SceneBuilder, folder: Path) -> list:
 def _appearance(builder: SceneBuilder, mesh, corners: Float64) -> tuple[int, tuple, Float64]:  # type: ignore[no-untyped-def]
     """Texture index, tint and uv [T, 3, 2] of a mesh; box-projected plaster where it has no image."""
     look = getattr(mesh.visual, "material", None)
-    image, uv = getattr(look, "image", None), getattr(mesh.visual, "uv", None)
+    image = getattr(look, "baseColorTexture", None) or getattr(look, "image", None)
+    uv = getattr(mesh.visual, "uv", None)
     if image is not None and uv is not None and len(uv) == len(mesh.vertices):
         pixels = np.asarray(image.convert("RGB"))
         side = min(_MAX_SIDE, 1 << int(np.ceil(np.log2(max(pixels.shape[:2])))))
