@@ -1,7 +1,7 @@
 """Ray casting and shading: colour and exact depth of a scene from a pinhole camera.
 
-One ray goes through every pixel centre; textures are filtered by their footprint, and only pixels on an edge of
-geometry or shadow are supersampled, which looks the same as supersampling everything at a fraction of the work.
+One ray goes through every pixel centre; textures are filtered by their footprint, and only pixels on an
+edge of geometry or shadow are supersampled: a fraction of the work of supersampling everything.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -57,7 +57,7 @@ class Renderer:
         return self._caster.compute_distance(o3d.core.Tensor(np.asarray(points, np.float32))).numpy()
 
     def render(self, camera: Camera, T_map_camera: Float64, supersampling: int = 2) -> tuple[UInt8, Float32]:
-        """Image [H, W, 3] and exact depth z [H, W] m (NaN = sky). ``supersampling`` n: n x n rays on edges."""
+        """Image [H, W, 3] and exact depth z [H, W] m (NaN = sky), with n x n rays on edges."""
         pixels = camera.pixel_grid().reshape(-1, 2)
         shape = (camera.height, camera.width)
         hits, directions, slant = self._trace(camera, T_map_camera, pixels)

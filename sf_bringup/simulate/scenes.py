@@ -1,4 +1,4 @@
-"""The worlds: furnished rooms, a machine hall, a palace with its garden, and a campus. World frame: z up, m."""
+"""The worlds: furnished rooms, a machine hall, a palace with its garden, a campus. z up, m."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -20,8 +20,8 @@ class RoomPlan:
     """A rectangular room centred on the origin and what stands in it.
 
     Args:
-        size: x, y, z m; wall, floor: material names; pieces: furniture along the walls, in order round the room
-        starting at the -y wall; centre: what stands in the middle.
+        size: x, y, z m; wall, floor: material names; pieces: furniture along the walls,
+        in order round the room starting at the -y wall; centre: what stands in the middle.
     """
 
     size: tuple[float, float, float]
@@ -106,7 +106,9 @@ def _piece(b: SceneBuilder, name: str) -> None:
         }[name](b)
 
 
-def _along_wall(b: SceneBuilder, length: float, distance: float, yaw: float, queue: list[str], index: int) -> None:
+def _along_wall(
+    b: SceneBuilder, length: float, distance: float, yaw: float, queue: list[str], index: int
+) -> None:
     """Fill one wall (its middle ``distance`` m from the origin) with pieces of the queue, pictures above."""
     place, used = [], 0.0
     while queue and used + _FOOTPRINT[queue[0]][0] < length - 1.3:

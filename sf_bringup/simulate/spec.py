@@ -20,9 +20,10 @@ class SimulationSpec:
 
     Args:
         scene: a name of ``SCENES``, or the path of a Gazebo ``.world`` file.
-        frames, fps: length and rate of the camera; width, height: px; focal: px; path: None = that of the scene.
-        rgb, depth, lidar: the sensors; lidar_hz: sweeps per second; lidar_fov_deg: horizontal field that is kept.
-        image_noise: deviation in grey levels; supersampling: n x n rays on edges; ground_truth_depth: also write it.
+        frames, fps: length and rate of the camera; width, height, focal: px; path: None = the scene's.
+        rgb, depth, lidar: the sensors; lidar_hz: sweeps per second; lidar_fov_deg: horizontal field.
+        image_noise: deviation in grey levels; supersampling: n x n rays on edges;
+        ground_truth_depth: also write it.
     """
 
     scene: str

@@ -15,8 +15,8 @@ class CameraPath:
     """A closed path flown at constant average speed.
 
     Args:
-        positions: way points [N, 3] m; yaw: [N] rad of the optical axis about z (unwrapped); pitch: [N] rad, up > 0;
-        turns: whole turns of yaw in one lap; speed: m/s.
+        positions: way points [N, 3] m; yaw: [N] rad of the optical axis about z (unwrapped);
+        pitch: [N] rad, up > 0; turns: whole turns of yaw in one lap; speed: m/s.
     """
 
     def __init__(self, positions: Float64, yaw: Float64, pitch: Float64, turns: int, speed: float) -> None:
@@ -58,7 +58,7 @@ class PathPlan:
 
 
 def oval(plan: PathPlan, seed: int, points: int = 16) -> CameraPath:
-    """A lap round the origin that looks in the direction of ``plan.heading`` from outward, with seeded sway."""
+    """A lap round the origin that looks ``plan.heading`` away from outward, with seeded sway."""
     rng = np.random.default_rng([seed, 77])
     a = 2 * np.pi * np.arange(points) / points
     c, s = np.cos(a), np.sin(a)
@@ -68,4 +68,6 @@ def oval(plan: PathPlan, seed: int, points: int = 16) -> CameraPath:
     jitter = rng.uniform(-1, 1, (points, 3)) * (0.05 * plan.half[0], 0.05 * plan.half[1], plan.sway)
     yaw = a + plan.heading + rng.uniform(-0.12, 0.12, points)
     pitch = plan.pitch + rng.uniform(-0.06, 0.06, points)
-    return CameraPath(np.column_stack([x, y, np.full(points, plan.height)]) + jitter, yaw, pitch, 1, plan.speed)
+    return CameraPath(
+        np.column_stack([x, y, np.full(points, plan.height)]) + jitter, yaw, pitch, 1, plan.speed
+    )

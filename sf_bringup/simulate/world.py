@@ -28,7 +28,9 @@ def load_world(path: Path) -> Scene:
     try:
         root = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError) as e:
-        raise FormatError(f"{path} is not a readable Gazebo world ({e}); give the path of a .world file") from e
+        raise FormatError(
+            f"{path} is not a readable Gazebo world ({e}); give the path of a .world file"
+        ) from e
     builder = SceneBuilder(0)
     models: dict[str, list] = {}
     for instance in root.iter("model"):
@@ -61,7 +63,9 @@ def _load_model(builder: SceneBuilder, folder: Path) -> list:
 
     meshes = sorted(p for p in folder.glob("meshes/*") if p.name.lower().endswith("_visual.dae"))
     if not meshes:
-        raise FormatError(f"model {folder.name} has no *_visual.dae mesh in {folder}; add it to the models folder")
+        raise FormatError(
+            f"model {folder.name} has no *_visual.dae mesh in {folder}; add it to the models folder"
+        )
     parts = []
     for file in meshes:
         unit = re.search(r'<unit[^>]*meter="([^"]+)"', file.read_text(errors="ignore"))
@@ -83,7 +87,8 @@ def _load_model(builder: SceneBuilder, folder: Path) -> list:
 def _appearance(builder: SceneBuilder, mesh, corners: Float64) -> tuple[int, tuple, Float64]:  # type: ignore[no-untyped-def]
     """Texture index, tint and uv [T, 3, 2] of a mesh; box-projected plaster where it has no image."""
     look = getattr(mesh.visual, "material", None)
-    image, uv = getattr(look, "image", None), getattr(mesh.visual, "uv", None)
+    image = getattr(look, "baseColorTexture", None) or getattr(look, "image", None)
+    uv = getattr(mesh.visual, "uv", None)
     if image is not None and uv is not None and len(uv) == len(mesh.vertices):
         pixels = np.asarray(image.convert("RGB"))
         side = min(_MAX_SIDE, 1 << int(np.ceil(np.log2(max(pixels.shape[:2])))))
