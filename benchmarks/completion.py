@@ -168,9 +168,7 @@ def main() -> None:
         results[protocol] = {}
         for name, method in METHODS.items():
             results[protocol][name] = row = measure(samples, method)
-            print(
-                f"{protocol:11s} {name:17s} " + "  ".join(f"{k} {v:.4f}" for k, v in row.items()), flush=True
-            )
+            print(f"{protocol:11s} {name:17s} " + "  ".join(f"{k} {v:.4f}" for k, v in row.items()), flush=True)
     args.out.write_text(json.dumps(results, indent=2) + "\n")
 
 

@@ -53,10 +53,11 @@ def namespace(topic: str) -> str:
 
 def needs_probe(types: Mapping[str, str]) -> list[str]:
     """Topics whose type alone does not tell their role."""
-    return sorted(name for name, kind in types.items() if kind == IMAGE and _is_input(name))
+    return sorted(name for name, kind in types.items() if kind == IMAGE and is_input(name))
 
 
-def _is_input(name: str) -> bool:
+def is_input(name: str) -> bool:
+    """Whether a topic may feed a line: not our own, not a reference, not housekeeping."""
     return name.startswith(tuple(t.name for t in topics.INPUTS)) or not name.startswith(_OWN)
 
 
@@ -116,7 +117,7 @@ def discover(
     user = dict(user or {})
     _check_user(user, types)
     decision = _Decision(dict(user), [f"{role} from {topic}, as you asked" for role, topic in user.items()])
-    inputs = {name: kind for name, kind in types.items() if _is_input(name)}
+    inputs = {name: kind for name, kind in types.items() if is_input(name)}
     images = [n for n, kind in inputs.items() if kind == IMAGE and n in probes]
     depth = [n for n in images if probes[n].encoding in DEPTH_ENCODINGS]
     color = [n for n in images if n not in depth]

@@ -140,9 +140,7 @@ class SceneBuilder:
         r, h = np.asarray(profile, dtype=float).T
         angle = np.linspace(0, 2 * np.pi, segments + 1)
         ring = np.stack([np.cos(angle) * squash[0], np.sin(angle) * squash[1]], -1)
-        p = np.concatenate(
-            [r[:, None, None] * ring, np.broadcast_to(h[:, None, None], (len(r), segments + 1, 1))], -1
-        )
+        p = np.concatenate([r[:, None, None] * ring, np.broadcast_to(h[:, None, None], (len(r), segments + 1, 1))], -1)
         slope_r, slope_h = np.gradient(r), np.gradient(h)
         n = np.concatenate(
             [
@@ -179,9 +177,7 @@ class SceneBuilder:
         )
         self.lathe(base, profile, texture, **look)  # type: ignore[arg-type]
 
-    def sphere(
-        self, centre: Vector, radius: float, texture: int, flatten: float = 1.0, **look: object
-    ) -> None:
+    def sphere(self, centre: Vector, radius: float, texture: int, flatten: float = 1.0, **look: object) -> None:
         """A sphere, or an ellipsoid of vertical half axis ``radius * flatten``."""
         a = np.linspace(-np.pi / 2, np.pi / 2, 13)
         profile = list(zip(radius * np.cos(a), radius * flatten * np.sin(a), strict=True))

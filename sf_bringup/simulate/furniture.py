@@ -115,9 +115,7 @@ def shelf(b: SceneBuilder, width: float = 1.4, height: float = 2.0, boards: int 
         while x < width / 2 - 0.1:
             w, h = b.rng.uniform(0.025, 0.07), pitch * b.rng.uniform(0.55, 0.85)
             cover = material(b, f"painting{b.rng.integers(1, 7)}")
-            b.box(
-                (x + w / 2, 0, k * pitch + 0.03), (w * 0.93, 0.22, h), cover, 0.6, b.rng.uniform(0.5, 1.1, 3)
-            )
+            b.box((x + w / 2, 0, k * pitch + 0.03), (w * 0.93, 0.22, h), cover, 0.6, b.rng.uniform(0.5, 1.1, 3))
             x += w if b.rng.random() < 0.93 else 0.16
 
 
@@ -129,9 +127,7 @@ def cabinet(b: SceneBuilder, width: float = 1.2, height: float = 0.85, wood: str
     for k in range(doors):
         x = (k + 0.5) * width / doors - width / 2
         b.box((x, 0.232, 0.12), (width / doors - 0.05, 0.025, height - 0.2), grain, 0.8, (1.12, 1.08, 1.0))
-        b.sphere(
-            (x + 0.3 * width / doors, 0.26, height / 2), 0.02, material(b, "metal"), gloss=0.6, segments=10
-        )
+        b.sphere((x + 0.3 * width / doors, 0.26, height / 2), 0.02, material(b, "metal"), gloss=0.6, segments=10)
     if height < 1.2:
         b.box((-0.3 * width, 0, height), (0.2, 0.04, 0.26), material(b, "painting2"), None)
         b.lathe(

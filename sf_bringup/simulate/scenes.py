@@ -106,9 +106,7 @@ def _piece(b: SceneBuilder, name: str) -> None:
         }[name](b)
 
 
-def _along_wall(
-    b: SceneBuilder, length: float, distance: float, yaw: float, queue: list[str], index: int
-) -> None:
+def _along_wall(b: SceneBuilder, length: float, distance: float, yaw: float, queue: list[str], index: int) -> None:
     """Fill one wall (its middle ``distance`` m from the origin) with pieces of the queue, pictures above."""
     place, used = [], 0.0
     while queue and used + _FOOTPRINT[queue[0]][0] < length - 1.3:

@@ -78,9 +78,7 @@ def bricks(rng: Rng, size: int, brick: Colour, mortar: Colour, rows: int = 12, c
     row = np.floor(v * rows).astype(int)
     x = u * columns + 0.5 * (row % 2)
     index = (row * columns + np.floor(x).astype(int) % columns) % (rows * columns)
-    edge = np.minimum(
-        np.minimum(x % 1, 1 - x % 1) / columns, np.minimum(v * rows % 1, 1 - v * rows % 1) / rows
-    )
+    edge = np.minimum(np.minimum(x % 1, 1 - x % 1) / columns, np.minimum(v * rows % 1, 1 - v * rows % 1) / rows)
     tone = rng.uniform(0.65, 1.2, (rows * columns, 1)) * rng.uniform(0.92, 1.08, (rows * columns, 3))
     face = np.asarray(brick, np.float32) * tone[index] * (1 + 0.14 * noise(rng, size, 0.75))[..., None]
     joint = np.asarray(mortar, np.float32) * (1 + 0.1 * noise(rng, size, 0.5))[..., None]

@@ -68,6 +68,4 @@ def oval(plan: PathPlan, seed: int, points: int = 16) -> CameraPath:
     jitter = rng.uniform(-1, 1, (points, 3)) * (0.05 * plan.half[0], 0.05 * plan.half[1], plan.sway)
     yaw = a + plan.heading + rng.uniform(-0.12, 0.12, points)
     pitch = plan.pitch + rng.uniform(-0.06, 0.06, points)
-    return CameraPath(
-        np.column_stack([x, y, np.full(points, plan.height)]) + jitter, yaw, pitch, 1, plan.speed
-    )
+    return CameraPath(np.column_stack([x, y, np.full(points, plan.height)]) + jitter, yaw, pitch, 1, plan.speed)

@@ -28,9 +28,7 @@ def load_world(path: Path) -> Scene:
     try:
         root = ElementTree.parse(path).getroot()
     except (OSError, ElementTree.ParseError) as e:
-        raise FormatError(
-            f"{path} is not a readable Gazebo world ({e}); give the path of a .world file"
-        ) from e
+        raise FormatError(f"{path} is not a readable Gazebo world ({e}); give the path of a .world file") from e
     builder = SceneBuilder(0)
     models: dict[str, list] = {}
     for instance in root.iter("model"):
@@ -63,9 +61,7 @@ def _load_model(builder: SceneBuilder, folder: Path) -> list:
 
     meshes = sorted(p for p in folder.glob("meshes/*") if p.name.lower().endswith("_visual.dae"))
     if not meshes:
-        raise FormatError(
-            f"model {folder.name} has no *_visual.dae mesh in {folder}; add it to the models folder"
-        )
+        raise FormatError(f"model {folder.name} has no *_visual.dae mesh in {folder}; add it to the models folder")
     parts = []
     for file in meshes:
         unit = re.search(r'<unit[^>]*meter="([^"]+)"', file.read_text(errors="ignore"))

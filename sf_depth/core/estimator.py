@@ -85,9 +85,7 @@ class DepthCompleter:
         padded = np.ones((grid_rows * size, grid_cols * size), dtype=bool)
         padded[:height, :width] = depth.valid
         corner = size * np.argwhere(~padded.reshape(grid_rows, size, grid_cols, size).all(axis=(1, 3)))
-        inside = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1).reshape(
-            -1, 2
-        )
+        inside = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1).reshape(-1, 2)
         z, variance = (np.full((height, width), np.nan, dtype=np.float32) for _ in range(2))
         for part in gp.chunks(len(corner)):
             query = np.minimum(corner[part, None] + inside, (height - 1, width - 1))
