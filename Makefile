@@ -3,6 +3,7 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 PY := $(VENV)/bin/python
+OPEN3D_NEEDS := libusb-1.0-0 libgl1 libgomp1
 READY := $(VENV)/.scenefactory
 # Python edits take effect at once (scenefactory_dev.pth); only what is compiled or declared needs a new install.
 DECLARED := pyproject.toml CMakeLists.txt $(wildcard sf_*/CMakeLists.txt sf_*/*/CMakeLists.txt sf_*/cmake/*.cmake \
@@ -39,4 +40,7 @@ $(READY): $(DECLARED)
 		{ echo "no way to create $(VENV): install python3-venv" >&2; exit 1; }
 	$(PY) -m pip install '.[test]'
 	@$(PY) .ci/link_checkout.py
+	@# Open3D's wheel links libraries that a bare system lacks.
+	@$(PY) -c 'import open3d' 2>/dev/null || { apt-get update -qq && apt-get install -y -qq $(OPEN3D_NEEDS); } || \
+		{ echo "Open3D cannot be imported: sudo apt-get install $(OPEN3D_NEEDS)" >&2; exit 1; }
 	@touch $@

@@ -1,0 +1,152 @@
+"""The tracker on scenes with exact poses: accuracy, determinism, loss and recovery."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sf_bringup.evaluation import trajectory_error
+from sf_interfaces.errors import FormatError
+from sf_interfaces.geometry import se3
+from sf_interfaces.types import Frame, Trajectory
+from sf_tracking.config import TrackingConfig
+from sf_tracking.core.patches import extract, to_gray
+from sf_tracking.core.tracker import Tracker, TrackingState
+from sf_tracking.core.update import PatchAlignment
+from tests.tracking.box_room import CAMERA, BoxRoom, path
+
+CONFIG = TrackingConfig(window=5)
+
+
+def sequence(kind: str, count: int = 45, seed: int = 3) -> tuple[list[Frame], Trajectory]:
+    room, poses = BoxRoom(seed), path(count)
+    frames = [room.frame(i, T, kind) for i, T in enumerate(poses)]
+    return frames, Trajectory(np.array([f.stamp_ns for f in frames]), poses)
+
+
+@pytest.mark.parametrize("kind", ["sparse", "dense"])
+def test_a_walk_is_tracked_to_millimetres(kind: str) -> None:
+    frames, truth = sequence(kind)
+    tracker = Tracker(CONFIG)
+    assert all(tracker.track(f).T_map_camera is not None for f in frames)
+    tracker.finish()
+    error = trajectory_error(tracker.trajectory(), truth)
+    assert error.pairs == len(frames)
+    assert error.rmse < 0.01 and error.path_length > 1.0  # m
+
+
+def test_keyframes_become_final_once_in_order_and_all_of_them() -> None:
+    frames, _ = sequence("sparse")
+    tracker = Tracker(CONFIG)
+    final = [k for f in frames for k in tracker.track(f).keyframes]
+    early = len(final)
+    final += tracker.finish().keyframes
+    stamps = [k.stamp_ns for k in final]
+    assert 0 < early < len(final)
+    assert stamps == sorted(set(stamps)) and stamps[0] == frames[0].stamp_ns
+    final_pose = dict(zip(tracker.trajectory().stamps_ns.tolist(), tracker.trajectory().poses, strict=True))
+    for keyframe in final:
+        np.testing.assert_array_equal(keyframe.T_map_camera, final_pose[keyframe.stamp_ns])
+        assert keyframe.depth is not None and keyframe.landmarks is not None
+
+
+def test_the_same_frames_give_the_same_bytes() -> None:
+    def run() -> bytes:
+        tracker = Tracker(CONFIG)
+        for frame in sequence("sparse", 25)[0]:
+            tracker.track(frame)
+        tracker.finish()
+        return tracker.trajectory().poses.tobytes()
+
+    assert run() == run()
+
+
+def test_changes_of_exposure_do_not_read_as_motion() -> None:
+    room, poses = BoxRoom(5), path(25)
+    gains = 1.0 - 0.35 * np.abs(np.sin(np.arange(25) / 3.0))
+    frames = [room.frame(i, T, "sparse", float(g)) for i, (T, g) in enumerate(zip(poses, gains, strict=True))]
+    tracker = Tracker(CONFIG)
+    for frame in frames:
+        tracker.track(frame)
+    tracker.finish()
+    truth = Trajectory(np.array([f.stamp_ns for f in frames]), poses)
+    assert trajectory_error(tracker.trajectory(), truth).rmse < 0.015
+
+
+def test_black_images_are_lost_and_the_known_place_is_found_again() -> None:
+    frames, truth = sequence("sparse", 30)
+    black = [replace(f, image=np.zeros_like(f.image)) for f in frames[18:21]]
+    tracker = Tracker(CONFIG)
+    states = [tracker.track(f).state for f in (*frames[:18], *black, *frames[21:])]
+    assert states[17] is TrackingState.TRACKING
+    assert states[18:21] == [TrackingState.LOST] * 3
+    assert states[-1] is TrackingState.TRACKING
+    tracker.finish()
+    assert len(tracker.trajectory()) == len(frames) - states.count(TrackingState.LOST)
+    assert trajectory_error(tracker.trajectory(), truth).rmse < 0.02
+
+
+def test_frames_without_depth_are_tracked_against_what_is_known() -> None:
+    room, poses = BoxRoom(3), path(20)
+    frames = [room.frame(i, T, "none" if i % 3 else "sparse") for i, T in enumerate(poses)]
+    tracker = Tracker(CONFIG)
+    assert all(tracker.track(f).T_map_camera is not None for f in frames)
+    tracker.finish()
+    truth = Trajectory(np.array([f.stamp_ns for f in frames]), poses)
+    assert trajectory_error(tracker.trajectory(), truth).rmse < 0.015
+
+
+def test_without_any_depth_it_keeps_initialising() -> None:
+    tracker = Tracker(CONFIG)
+    update = tracker.track(BoxRoom().frame(0, np.eye(4), "none"))
+    assert update.state is TrackingState.INITIALISING and update.T_map_camera is None
+    assert tracker.finish().keyframes == ()
+
+
+def test_a_large_first_motion_is_survived() -> None:
+    room = BoxRoom(7)
+    jump = se3.exp(np.array([0.25, 0.0, 0.1, 0.0, 0.06, 0.0]))  # about 40 px on a 320 px image
+    tracker = Tracker(CONFIG)
+    tracker.track(room.frame(0, np.eye(4)))
+    found = tracker.track(room.frame(1, jump)).T_map_camera
+    assert found is not None
+    np.testing.assert_allclose(found[:3, 3], jump[:3, 3], atol=0.01)
+
+
+def test_bad_frames_are_refused_in_a_sentence() -> None:
+    room, tracker = BoxRoom(), Tracker(CONFIG)
+    frame = room.frame(5, np.eye(4))
+    tracker.track(frame)
+    with pytest.raises(FormatError, match="does not increase"):
+        tracker.track(frame)
+    with pytest.raises(FormatError, match="image and its camera_info"):
+        tracker.track(Frame(frame.stamp_ns + 1, None))
+
+
+def test_patches_are_spread_measured_and_away_from_steps_in_depth() -> None:
+    room = BoxRoom(1)
+    frame = room.frame(0, se3.exp(np.array([0, 0, 0, 0, 0.5, 0])), "dense")
+    z = np.array(frame.depth.z)
+    z[:, 200:] += 1.0  # an artificial step
+    stepped = replace(frame, depth=replace(frame.depth, z=z))
+    patches = extract(stepped, to_gray(frame.image), TrackingConfig(patches=100))
+    assert 50 < len(patches) <= 100
+    col, row = np.floor(patches.uv).astype(int).T
+    np.testing.assert_allclose(patches.points[:, 2], z[row, col])
+    assert (np.abs(col - 199.5) > 3).all()
+    quadrants = {(c > CAMERA.width // 2, r > CAMERA.height // 2) for c, r in zip(col, row, strict=True)}
+    assert len(quadrants) == 4
+
+
+def test_confidence_is_low_along_an_edge_of_the_image() -> None:
+    gray = np.zeros((240, 320), np.uint8)
+    gray[:, 160:] = 200  # only horizontal gradients: vertical motion is unobservable
+    operator = PatchAlignment(TrackingConfig())
+    frame = BoxRoom().frame(0, np.eye(4), "dense")
+    patches = extract(frame, to_gray(frame.image), TrackingConfig(patches=30))
+    tensor = np.broadcast_to(np.diag([400.0, 1e-3]), (len(patches), 2, 2))
+    update = operator(gray, replace(patches, tensor=tensor), gray, patches.uv, wide=False)
+    assert (update.information[:, 0, 0] > 10 * update.information[:, 1, 1]).all()
