@@ -118,9 +118,7 @@ class Orchestrator(Node):
             user = {role: topic for role, topic in self._user.items() if topic in types}
             mapping = discovery.discover(types, self._probes, user)
             made = plan(mapping.available, self._goal, load_blocks())
-            wanted = launches(
-                made, mapping.roles, self._config, lossless=self._replay, out=str(self._folder.resolve())
-            )
+            wanted = launches(made, mapping.roles, self._config, lossless=self._replay, out=str(self._folder.resolve()))
         except PlanError as error:
             self._say(f"no line: {error}")
             self._line.apply(())

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sf_bringup.credits import Credits
 from sf_interfaces.errors import ConfigError, FormatError, SceneFactoryError
 from sf_interfaces.io.bag import BagReader, RawMessage
 from sf_interfaces.ros.messages import rclpy_factory, to_ns, to_stamp
@@ -65,29 +66,6 @@ class PlayOptions:
             raise ConfigError(f"--in-flight {self.in_flight} must be at least 1")
         if self.lossless and not self.consumed:
             raise ConfigError("--lossless needs --consumed TOPIC, where a head node tells what it has taken in")
-
-
-class Credits:
-    """Which images each consumer still owes. A consumed stamp settles all earlier ones too."""
-
-    def __init__(self, consumers: tuple[str, ...]):
-        self._owed: dict[str, deque[int]] = {name: deque() for name in consumers}
-
-    def sent(self, stamp_ns: int) -> None:
-        """An image has been published."""
-        for owed in self._owed.values():
-            owed.append(stamp_ns)
-
-    def consumed(self, consumer: str, stamp_ns: int) -> None:
-        """A consumer has taken in the image of this stamp."""
-        owed = self._owed[consumer]
-        while owed and owed[0] <= stamp_ns:
-            owed.popleft()
-
-    @property
-    def in_flight(self) -> int:
-        """Images the slowest consumer still owes."""
-        return max((len(owed) for owed in self._owed.values()), default=0)
 
 
 def header_stamp(cdr: bytes) -> int:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.lidar import deskew, project_sweep
 from sf_interfaces.geometry.undistort import Distortion, undistort_depth, undistort_image
 from sf_interfaces.ros.frames import FrameTree
+from sf_interfaces.streams import Stream, StreamItem, StreamKey
 from sf_interfaces.types import Camera, DepthMap, Float64, Frame, PointCloud, SparseDepth, UInt8, check_pose
 
 _S = 1_000_000_000  # ns
@@ -49,82 +50,6 @@ class SyncConfig:
         return "image" if self.image else "depth"
 
 
-class _Key(NamedTuple):
-    """A point in time that survives backward jumps: jumps so far, then the stamp."""
-
-    epoch: int
-    stamp_ns: int
-
-
-@dataclass(slots=True)
-class _Item:
-    key: _Key
-    value: Any
-    frame_id: str = ""
-    used: bool = False
-
-
-class _Stream:
-    """One sensor: its messages that may still be needed, in time order."""
-
-    def __init__(self, name: str, reset_s: float) -> None:
-        self.name = name
-        self.items: deque[_Item] = deque()
-        self.newest: _Key | None = None
-        self._reset_ns = int(reset_s * _S)
-
-    def advance(self, stamp_ns: int) -> tuple[_Key | None, str]:
-        """The key of a new message (None: refuse it) and a reason worth counting ("" if none)."""
-        reason = ""
-        if self.newest is None:
-            key = _Key(0, stamp_ns)
-        elif stamp_ns > self.newest.stamp_ns:
-            key = _Key(self.newest.epoch, stamp_ns)
-        elif self.newest.stamp_ns - stamp_ns > self._reset_ns:
-            key = _Key(self.newest.epoch + 1, stamp_ns)
-            reason = f"time of {self.name} jumped back: a new sequence begins"
-        else:
-            return None, f"{self.name} dropped: its stamp is not newer than the one before"
-        self.newest = key
-        if stamp_ns == 0:
-            reason = f"{self.name} has stamp 0: let the driver fill header.stamp"
-        return key, reason
-
-    def passed(self, key: _Key) -> bool:
-        """Nothing that arrives from now on can be nearer to ``key`` than what is here."""
-        return self.newest is not None and self.newest >= key
-
-    def around(self, key: _Key) -> tuple[_Item | None, _Item | None]:
-        """The last message at or before ``key`` and the first at or after it, of the same epoch."""
-        before = after = None
-        for item in self.items:
-            if item.key.epoch == key.epoch and item.key <= key:
-                before = item
-            if item.key.epoch == key.epoch and item.key >= key:
-                after = item
-                break
-        return before, after
-
-    def nearest(self, key: _Key, slop_s: float) -> _Item | None:
-        """The message nearest in time within the slop; of two equally near the earlier."""
-        found = [item for item in self.around(key) if item is not None]
-        if not found:
-            return None
-        best = min(found, key=lambda item: abs(item.key.stamp_ns - key.stamp_ns))
-        if abs(best.key.stamp_ns - key.stamp_ns) > round(slop_s * _S):
-            return None
-        best.used = True
-        return best
-
-    def forget(self, key: _Key) -> int:
-        """Drop what no frame after ``key`` can need; returns how many of it were never used."""
-        unused = 0
-        # The last message at or before the key may still be the nearest to the next frame.
-        while len(self.items) > 1 and self.items[1].key <= key:
-            unused += not self.items.popleft().used
-        return unused
-
-
 class FrameAssembler:
     """Joins pushed messages into frames, in the order of their image stamps.
 
@@ -145,10 +70,10 @@ class FrameAssembler:
         self.epoch = 0
         self.transforms = FrameTree()
         self._cameras: dict[str, tuple[Camera, Distortion | None]] = {}
-        self._pending: deque[_Item] = deque()
+        self._pending: deque[StreamItem] = deque()
         wanted = {"image": config.image, "depth": config.depth, "lidar": config.lidar, "pose": config.pose}
         wanted[config.leader] = True
-        self._streams = {name: _Stream(name, config.reset_s) for name, on in wanted.items() if on}
+        self._streams = {name: Stream(name, config.reset_s) for name, on in wanted.items() if on}
         self._extrinsics: dict[tuple[str, str], Float64] = {}
         self._lidar_frame = ""
         self._sweeps_without_extrinsic = 0
@@ -228,7 +153,7 @@ class FrameAssembler:
             if frame is not None:
                 yield frame
         if self._ended and not self._pending:
-            self._forget(_Key(np.iinfo(np.int64).max, 0))
+            self._forget(StreamKey(np.iinfo(np.int64).max, 0))
 
     @property
     def waiting_for(self) -> str:
@@ -262,9 +187,9 @@ class FrameAssembler:
             self._count(reason)
         if key is not None:
             queue = self._pending if name == self.config.leader else stream.items
-            queue.append(_Item(key, value, frame_id.lstrip("/")))
+            queue.append(StreamItem(key, value, frame_id.lstrip("/")))
 
-    def _decidable(self, item: _Item) -> bool:
+    def _decidable(self, item: StreamItem) -> bool:
         if self._ended or len(self._pending) > self.config.max_pending:
             return True
         complete = (
@@ -278,7 +203,7 @@ class FrameAssembler:
         late_ns = newest.stamp_ns - item.key.stamp_ns
         return newest.epoch > item.key.epoch or late_ns > self.config.max_wait_s * _S
 
-    def _assemble(self, item: _Item) -> Frame | None:
+    def _assemble(self, item: StreamItem) -> Frame | None:
         if item.frame_id not in self._cameras:
             raise CalibrationError(self._no_camera(item.frame_id))
         camera, distortion = self._cameras[item.frame_id]
@@ -292,9 +217,10 @@ class FrameAssembler:
         sparse = self._sparse(item, camera, twist) if self.config.lidar else None
         return Frame(item.key.stamp_ns, camera, image, depth, sparse, T)
 
-    def _depth(self, item: _Item) -> DepthMap | None:
+    def _depth(self, item: StreamItem) -> DepthMap | None:
         if not self.config.image:
-            return item.value
+            leading: DepthMap = item.value
+            return leading
         if not self.config.depth:
             return None
         found = self._streams["depth"].nearest(item.key, self.config.depth_slop_s)
@@ -306,9 +232,10 @@ class FrameAssembler:
                 f"depth is in frame '{found.frame_id}', the image in '{item.frame_id}'; register depth to "
                 "the image, or set sync.depth_registered if it is registered"
             )
-        return found.value
+        matched: DepthMap = found.value
+        return matched
 
-    def _sparse(self, item: _Item, camera: Camera, twist: Float64 | None) -> SparseDepth | None:
+    def _sparse(self, item: StreamItem, camera: Camera, twist: Float64 | None) -> SparseDepth | None:
         found = self._streams["lidar"].nearest(item.key, self.config.lidar_slop_s)
         if found is None:
             self._count(f"image without a lidar sweep within {self.config.lidar_slop_s:g} s")
@@ -328,7 +255,7 @@ class FrameAssembler:
             points = deskew(points, offset_ns, twist_lidar)
         return project_sweep(points, camera, T_camera_lidar)
 
-    def _pose(self, item: _Item, camera_frame: str) -> tuple[Float64 | None, Float64 | None]:
+    def _pose(self, item: StreamItem, camera_frame: str) -> tuple[Float64 | None, Float64 | None]:
         """The given ``T_map_camera`` at the image stamp and the camera's twist there, or None."""
         before, after = self._streams["pose"].around(item.key)
         if before is None or after is None:
@@ -389,7 +316,7 @@ class FrameAssembler:
             f"no transform from '{self._lidar_frame}' to '{camera_frame}': publish it on /tf_static or pass --extrinsic"
         )
 
-    def _forget(self, key: _Key) -> None:
+    def _forget(self, key: StreamKey) -> None:
         for name, stream in self._streams.items():
             unused = stream.forget(key)
             if unused and name in ("depth", "lidar"):

@@ -41,13 +41,13 @@ def _set(instance: object, name: str, value: object) -> None:
     object.__setattr__(instance, name, value)
 
 
-def check_pose(T: Any, name: str = "pose") -> Float64:
+def check_pose(given: Any, name: str = "pose") -> Float64:
     """A read-only float64 [4, 4] rigid motion.
 
     Raises:
         FormatError: not 4x4, not finite, or its rotation is not orthonormal within 1e-3.
     """
-    T = _frozen(T, np.float64)
+    T: Float64 = _frozen(given, np.float64)  # [4, 4]
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise FormatError(f"{name} must be a finite 4x4 matrix, got shape {T.shape}")
     if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 1e-3:
@@ -176,7 +176,7 @@ class SparseDepth:
     def from_map(depth: DepthMap) -> SparseDepth:
         """The valid pixels of a depth map, at their centres, in row-major order."""
         row, col = np.nonzero(depth.valid)
-        return SparseDepth(np.stack([col + 0.5, row + 0.5], axis=-1), depth.z[row, col])
+        return SparseDepth(np.stack([col + 0.5, row + 0.5], axis=-1), depth.z[row, col].astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,8 +209,8 @@ class PointCloud:
         return len(self.points)
 
 
-def _check_image(image: Any, camera: Camera | None) -> UInt8:
-    image = _frozen(image, np.uint8)
+def _check_image(given: Any, camera: Camera | None) -> UInt8:
+    image: UInt8 = _frozen(given, np.uint8)
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise FormatError(f"image must have shape (H, W) or (H, W, 3), got {image.shape}")
     if camera is not None and image.shape[:2] != (camera.height, camera.width):

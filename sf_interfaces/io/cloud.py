@@ -21,5 +21,5 @@ def write_surface(path: Path, cloud: PointCloud) -> None:
     out = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points.astype(np.float64)))
     if cloud.colors is not None:
         out.colors = o3d.utility.Vector3dVector(cloud.colors / 255.0)
-    if not o3d.io.write_point_cloud(str(path), out):
+    if not o3d.io.write_point_cloud(path, out):
         raise FormatError(f"cannot write {path}; choose a folder that can be written")

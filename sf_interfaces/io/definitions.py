@@ -54,6 +54,6 @@ def definition(name: str) -> str | None:
     try:
         if not _add(store, name):
             return None
-        return store.generate_msgdef(name, ros_version=2)[0]
+        return str(store.generate_msgdef(name, ros_version=2)[0])
     except TypesysError:
         return None

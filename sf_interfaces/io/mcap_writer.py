@@ -59,7 +59,7 @@ def qos_yaml(reliable: bool = True, latched: bool = False) -> str:
 def _bytes(record: McapRecord) -> bytes:
     builder = RecordBuilder()
     record.write(builder)
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    data: bytes = builder.end()
     return data
 
 
@@ -127,7 +127,7 @@ class McapWriter:
     def _channel(self, topic: str, kind: str, qos: str | None, text: str | None) -> int:
         known = self._channels.get((topic, kind))
         if known is not None:
-            return known.id
+            return int(known.id)
         if kind not in self._schemas:
             text = text or definition(kind)
             schema = Schema(
@@ -148,7 +148,7 @@ class McapWriter:
         )
         self._channels[topic, kind] = channel
         self._append(_bytes(channel))
-        return channel.id
+        return int(channel.id)
 
     def write(
         self,

@@ -44,7 +44,7 @@ class TornMcap:
                 elif isinstance(record, Channel):
                     self.channels[record.id] = record
                 else:
-                    entry = Entry(record.log_time, offset, position, record.channel_id)  # type: ignore[attr-defined]
+                    entry = Entry(record.log_time, offset, position, record.channel_id)
                     self.entries.append(entry)
                     position += 1
         self.entries.sort(key=lambda entry: entry.log_time)
@@ -68,7 +68,7 @@ class TornMcap:
             with self._path.open("rb") as file:
                 file.seek(chunk)
                 records = breakup_chunk(Chunk.read(ReadDataStream(file)))
-            self._cached = (chunk, [r.data for r in records if not isinstance(r, (Schema, Channel))])  # type: ignore[attr-defined]
+            self._cached = (chunk, [r.data for r in records if not isinstance(r, (Schema, Channel))])
         return self._cached[1]
 
     def data(self, entry: Entry) -> bytes:

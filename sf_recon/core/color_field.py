@@ -8,6 +8,7 @@ the rows near the training pixels are touched in an iteration.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -61,7 +62,7 @@ class ColorField(torch.nn.Module):
         self.features = [torch.zeros(0, features) for _ in points.levels]
         sizes = [features * len(points.levels), hidden, hidden, 3]
         layers: list[torch.nn.Module] = []
-        for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
+        for inputs, outputs in pairwise(sizes):
             linear = torch.nn.Linear(inputs, outputs)
             torch.nn.init.xavier_uniform_(linear.weight, generator=generator)
             torch.nn.init.zeros_(linear.bias)

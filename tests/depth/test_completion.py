@@ -1,4 +1,4 @@
-"""Completion is exact on planes, honest about its error, sharp at image edges, deterministic, and keeps measurements."""
+"""Completion is exact on planes, honest about its error, sharp at edges, deterministic, and keeps measurements."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
