@@ -92,7 +92,7 @@ def predict(
 
 
 def leave_one_out(tiles: Solved) -> tuple[torch.Tensor, torch.Tensor]:
-    """Error and unit-amplitude variance of the nearest observation of each tile, predicted from its others, [B]."""
+    """Error and unit-amplitude variance of each tile's nearest observation, given its others, [B]."""
     own = tiles.inverse[:, 0, 0]
     return tiles.alpha[:, 0] / own, 1.0 / own
 
