@@ -104,7 +104,7 @@ class DepthCompleter:
     def _estimate(
         self, observed: gp.Observations, tree: cKDTree, image: UInt8
     ) -> tuple[Hyperparameters, PixelCovariance]:
-        """Correlation length of the greatest leave-one-out likelihood, and variances that match its errors."""
+        """Correlation length of the greatest leave-one-out likelihood, and variances to match its errors."""
         cells = np.unique(observed.index // _SPACING_CELL, axis=0)
         spacing = float(np.sqrt(len(cells) * _SPACING_CELL**2 / len(observed.z)))
         rng = np.random.default_rng(self._config.seed)
