@@ -1,7 +1,7 @@
 """Sparse LiDAR depth completion on real KITTI data, beside classical interpolation.
 
-Two protocols: ``stereo2015`` scores at ground-truth pixels without a scan point; ``heldout`` drops half of the scan
-points of an odometry sequence and predicts them. Prints a table and writes JSON.
+Two protocols: ``stereo2015`` scores at ground-truth pixels without a scan point; ``heldout`` drops half of
+the scan points of an odometry sequence and predicts them. Prints a table and writes JSON.
 """
 
 # SPDX-License-Identifier: Apache-2.0

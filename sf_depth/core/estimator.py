@@ -23,7 +23,7 @@ _SPACING_CELL = 16  # px; side of the cells that measure which area the observat
 
 @dataclass(frozen=True, slots=True)
 class Hyperparameters:
-    """What one image says about its own depth: correlation length px, typical amplitude, calibration factor."""
+    """What one image says about its depth: correlation length px, prior variance, calibration factor."""
 
     length_px: float
     amplitude: float
@@ -45,8 +45,8 @@ class DepthCompleter:
     def complete(self, keyframe: Keyframe) -> Keyframe:
         """The keyframe with depth at every pixel and its variance, m^2.
 
-        Measured pixels keep their depth and carry the sensor's variance. Pixels far from any measurement carry a
-        large variance; with ``max_sigma`` they become NaN.
+        Measured pixels keep their depth and carry the sensor's variance. Pixels far from any measurement
+        carry a large variance; with ``max_sigma`` they become NaN.
 
         Raises:
             FormatError: the keyframe has no depth, of another size, or fewer than four measured pixels.
@@ -54,7 +54,7 @@ class DepthCompleter:
         depth = keyframe.depth
         if depth is None:
             raise FormatError(
-                f"keyframe {keyframe.stamp_ns} has no depth to complete; give sparse depth such as a LiDAR sweep"
+                f"keyframe {keyframe.stamp_ns} has no depth to complete; give sparse depth, as of a LiDAR"
             )
         if depth.z.shape != keyframe.image.shape[:2]:
             raise FormatError(f"depth {depth.z.shape} and image {keyframe.image.shape[:2]} differ in size")
@@ -85,7 +85,7 @@ class DepthCompleter:
         padded = np.ones((grid_rows * size, grid_cols * size), dtype=bool)
         padded[:height, :width] = depth.valid
         corner = size * np.argwhere(~padded.reshape(grid_rows, size, grid_cols, size).all(axis=(1, 3)))
-        inside = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = np.indices((size, size)).reshape(2, -1).T
         z, variance = (np.full((height, width), np.nan, dtype=np.float32) for _ in range(2))
         for part in gp.chunks(len(corner)):
             query = np.minimum(corner[part, None] + inside, (height - 1, width - 1))
@@ -104,7 +104,7 @@ class DepthCompleter:
     def _estimate(
         self, observed: gp.Observations, tree: cKDTree, image: UInt8
     ) -> tuple[Hyperparameters, PixelCovariance]:
-        """Correlation length of the greatest leave-one-out likelihood, and variances that match its errors."""
+        """Correlation length of the greatest leave-one-out likelihood, and variances to match its errors."""
         cells = np.unique(observed.index // _SPACING_CELL, axis=0)
         spacing = float(np.sqrt(len(cells) * _SPACING_CELL**2 / len(observed.z)))
         rng = np.random.default_rng(self._config.seed)

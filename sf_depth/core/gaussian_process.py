@@ -15,7 +15,7 @@ import torch
 from sf_depth.core.covariance import PixelCovariance, kernel
 from sf_interfaces.types import Float32, Float64
 
-_CHUNK = 2048  # tiles solved at once; bounds memory to about 100 MB
+_CHUNK = 256  # tiles solved at once; few enough to stay in the processor's cache
 _PRIOR_COUNT = 8.0  # how many observations the image-wide amplitude weighs in a tile's own
 
 
@@ -90,7 +90,7 @@ def predict(
 
 
 def leave_one_out(tiles: Solved) -> tuple[torch.Tensor, torch.Tensor]:
-    """Error and unit-amplitude variance of the nearest observation of each tile, predicted from its others, [B]."""
+    """Error and unit-amplitude variance of each tile's nearest observation, given its others, [B]."""
     own = tiles.inverse[:, 0, 0]
     return tiles.alpha[:, 0] / own, 1.0 / own
 
