@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sf_bringup.discovery import DENSE_FRACTION
 from sf_bringup.evaluation import (
     DepthError,
     TrajectoryError,
@@ -111,6 +112,8 @@ def measure_completion(run: RunFolder, holdout: float, seed: int = 0) -> DepthEr
     rng = np.random.default_rng(seed)
     errors = []
     for stamp, depth in decoded(run.result, topics.KEYFRAME_DEPTH.name, decode_depth, stamps):
+        if depth.density > DENSE_FRACTION:
+            break
         row, col = np.nonzero(depth.valid)
         dropped = rng.permutation(len(row))[: int(holdout * len(row))]
         kept, target = np.array(depth.z), np.full_like(depth.z, np.nan)
