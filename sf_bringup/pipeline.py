@@ -20,7 +20,7 @@ from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import sync_values
 from sf_interfaces.blocks import BlockSpec
 from sf_interfaces.config import ConfigFile, build
-from sf_interfaces.errors import ConfigError
+from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.cloud import write_surface
 from sf_interfaces.io.sequence_writer import SequenceWriter
@@ -63,8 +63,15 @@ class ProductionLine:
         self.tracker = parts.get("tracking")
         self._completer = parts.get("depth:complete")
         self.reconstruction = parts.get("recon")
-        self._writer = writer
+        self._writer, self._config, self._epoch = writer, config, 0
         self.keyframe_poses: list[tuple[int, Float64]] = []
+
+    def in_epoch(self, epoch: int) -> None:
+        """A backward jump of time ends one sequence and begins another: the tracker starts anew."""
+        if self.tracker is not None and epoch != self._epoch:
+            self._finish_keyframes(self.tracker.finish().keyframes)
+            self.tracker = make_part("tracking", self._config)
+        self._epoch = epoch
 
     def step(self, frame: Frame) -> Float64 | None:
         """Take one frame through the line; everything it completes goes to the writer.
@@ -140,16 +147,26 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
         done = 0
         for raw in reader.messages(list(kinds)):
             inputs.push(kinds[raw.topic], reader.decode(raw))
-            for frame in inputs.assembler.ready():
-                inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
-                done += 1
+            done += _advance(line, inputs)
             progress.update(done, given.leading_messages)
         inputs.assembler.end()
-        for frame in inputs.assembler.ready():
-            inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
+        done += _advance(line, inputs)
+        if not done:
+            reasons = "; ".join(inputs.assembler.reasons) or "it has no message on the chosen topics"
+            raise FormatError(f"no frame of {given.bag} could be used: {reasons}")
         line.finish()
         _save(folder, line, writer)
     return dict(inputs.assembler.reasons)
+
+
+def _advance(line: ProductionLine, inputs: SensorInputs) -> int:
+    """Step through the frames that are ready; returns how many there were."""
+    done = 0
+    for frame in inputs.assembler.ready():
+        line.in_epoch(inputs.assembler.epoch)
+        inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
+        done += 1
+    return done
 
 
 _KIND = {"rgb": "image", "camera_info": "camera_info", "depth": "depth", "lidar": "lidar", "pose": "pose"}

@@ -39,6 +39,8 @@ class Stream:
     def advance(self, stamp_ns: int) -> tuple[StreamKey | None, str]:
         """The key of a new message (None: refuse it) and a reason worth counting ("" if none)."""
         reason = ""
+        if stamp_ns == 0:
+            return None, f"{self.name} dropped: its stamp is 0; let the driver fill header.stamp"
         if self.newest is None:
             key = StreamKey(0, stamp_ns)
         elif stamp_ns > self.newest.stamp_ns:
@@ -49,8 +51,6 @@ class Stream:
         else:
             return None, f"{self.name} dropped: its stamp is not newer than the one before"
         self.newest = key
-        if stamp_ns == 0:
-            reason = f"{self.name} has stamp 0: let the driver fill header.stamp"
         return key, reason
 
     def passed(self, key: StreamKey) -> bool:

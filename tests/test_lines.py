@@ -99,7 +99,8 @@ def test_depth_alone_goes_through_flexion(tmp_path: Path) -> None:
     assert run(str(stripped), "--goal", "tracking", "--out", str(out)) == 0
     s = summary(out)
     assert s["line"] == ["flexion", "tracking"]
-    assert s["trajectory"]["rmse"] < 0.1 and s["trajectory"]["pairs"] > 0.7 * SMALL["frames"]
+    # Curvature alone is a poor texture: what is tracked has to be right, not everything is tracked.
+    assert s["trajectory"]["rmse"] < 0.05 and s["trajectory"]["pairs"] >= SMALL["frames"] // 2
 
 
 def test_given_poses_replace_the_tracker(rgbl: Path, tmp_path: Path) -> None:

@@ -1,0 +1,209 @@
+"""The whole graph as processes: equal to the in-process line, complete, live without loss, and never left behind."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from sf_bringup.simulate import SimulationSpec, simulate
+from sf_interfaces.io.bag import BagReader
+from sf_interfaces.io.trajectory import read_tum
+
+pytestmark = pytest.mark.graph
+FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.keyframe_pixels=16384"]
+_domains = iter(range(40, 90))
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("graph") / "rgbl.mcap"
+    size = {"width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
+    simulate(SimulationSpec("lounge", frames=16, fps=10.0, lidar="spinning64", **size), path)
+    return path
+
+
+@pytest.fixture
+def environment() -> dict[str, str]:
+    own = {"ROS_DOMAIN_ID": str(next(_domains)), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+    return {**os.environ, **own}
+
+
+def sf(environment: dict[str, str], *args: str, timeout: float = 200) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sf_bringup.cli", *args]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout)
+
+
+def ours(marker: str) -> list[int]:
+    """Processes whose command line mentions ``marker``."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            if marker.encode() in (entry / "cmdline").read_bytes() and int(entry.name) != os.getpid():
+                found.append(int(entry.name))
+        except OSError:
+            continue
+    return found
+
+
+def gone(marker: str, seconds: float) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if not ours(marker):
+            return True
+        time.sleep(0.05)
+    return not ours(marker)
+
+
+def wait_for(condition: object, seconds: float = 60.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if condition():  # type: ignore[operator]
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def test_lossless_graph_equals_the_process_and_itself(bag: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    outs = [tmp_path / name for name in ("inproc", "ros1", "ros2")]
+    first = sf(environment, "run", str(bag), "--goal", "tracking", "--out", str(outs[0]))
+    assert first.returncode == 0, first.stderr
+    for out in outs[1:]:
+        done = sf(environment, "run", str(bag), "--goal", "tracking", "--engine", "ros", "--out", str(out))
+        assert done.returncode == 0, done.stderr
+    files = [(out / "trajectory.tum").read_bytes() for out in outs]
+    assert files[1] == files[2], "two lossless replays give the same trajectory byte for byte"
+    inproc, ros = read_tum(outs[0] / "trajectory.tum"), read_tum(outs[1] / "trajectory.tum")
+    np.testing.assert_array_equal(inproc.stamps_ns, ros.stamps_ns)
+    np.testing.assert_allclose(inproc.poses, ros.poses, atol=1e-6)
+
+
+def test_rgbl_graph_records_everything_for_every_keyframe(
+    bag: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    done = sf(environment, "run", str(bag), "--engine", "ros", "--out", str(tmp_path), *FAST)
+    assert done.returncode == 0, done.stderr
+    keyframes = len((tmp_path / "keyframes.tum").read_text().splitlines())
+    with BagReader(tmp_path / "result.mcap") as result:
+        for part in ("image", "variance", "pose", "camera_info"):
+            assert result.topics[f"/sf/depth/dense/{part}"].count == keyframes
+        for part in ("image", "camera_info", "pose", "depth", "landmarks"):
+            assert result.topics[f"/sf/tracking/keyframe/{part}"].count == keyframes
+        assert result.topics["/sf/recon/surface"].count >= keyframes
+        assert result.topics["/sf/tracking/pose"].count == 16
+        assert result.topics["/sf/tracking/path"].count >= 1
+        assert result.topics["/tf"].count == 16 and result.topics["/tf_static"].count >= 1
+    with (tmp_path / "result.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert {m.name for m in reader.iter_metadata()} >= {"scenefactory", "calibration"}
+        assert {a.name for a in reader.iter_attachments()} >= {"trajectory.tum", "config.yaml"}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["trajectory"]["rmse"] < 0.03 and summary["depth"]["absrel"] < 8
+    assert gone(str(tmp_path), 3.0)
+
+
+def test_ctrl_c_ends_everything_and_keeps_the_recording(bag: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    check_end(signal.SIGINT, bag, environment, tmp_path)
+
+
+def test_a_killed_parent_leaves_nothing_behind(bag: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    check_end(signal.SIGKILL, bag, environment, tmp_path)
+
+
+def check_end(number: signal.Signals, bag: Path, environment: dict[str, str], out: Path) -> None:
+    command = [
+        sys.executable,
+        "-m",
+        "sf_bringup.cli",
+        "run",
+        str(bag),
+        "--engine",
+        "ros",
+        "--out",
+        str(out),
+        "--rate",
+        "0.5",
+    ]
+    parent = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        assert wait_for(lambda: (out / "log" / "player.log").is_file() and len(ours(str(out))) >= 5)
+        time.sleep(3.0)  # in the middle of playing
+        parent.send_signal(number)
+        assert gone(str(out), 3.0), f"left behind: {ours(str(out))}"
+    finally:
+        parent.kill()
+        parent.wait()
+    with BagReader(out / "result.mcap") as result:
+        assert sum(info.count for info in result.topics.values()) > 0
+
+
+def test_live_play_loses_nothing_between_player_and_tracker(
+    bag: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    args = ("run", str(bag), "--goal", "tracking", "--engine", "ros", "--rate", "1", "--out", str(tmp_path))
+    done = sf(environment, *args)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert not any(summary["dropped"].values()), summary["dropped"]
+    assert summary["trajectory"]["pairs"] == 16
+
+
+def test_a_refused_setting_ends_the_run_with_its_sentence(
+    bag: Path, environment: dict[str, str], tmp_path: Path
+) -> None:
+    args = ("run", str(bag), "--engine", "ros", "--out", str(tmp_path), "--set", "tracking.patches=1")
+    done = sf(environment, *args)
+    assert done.returncode == 2 and "patches" in done.stderr and "Traceback" not in done.stderr
+    assert gone(str(tmp_path), 3.0)
+
+
+@pytest.fixture
+def live(bag: Path, environment: dict[str, str], tmp_path: Path) -> Iterator[Path]:
+    """A line brought up by the orchestrator on topics that a looping player publishes."""
+    play = ["-m", "sf_bringup.cli", "play", str(bag), "--loop", "--wait", "0.5"]
+    up = ["-m", "sf_bringup.cli", "up", "--out", str(tmp_path / "up")]
+    log = (tmp_path / "up.log").open("wb")
+    children = [
+        subprocess.Popen([sys.executable, *args], env=environment, stdout=log, stderr=log) for args in (play, up)
+    ]
+    try:
+        yield tmp_path
+    finally:
+        for child in reversed(children):
+            child.send_signal(signal.SIGINT)
+        for child in children:
+            child.wait(timeout=10)
+
+
+def test_the_orchestrator_builds_the_line_from_live_topics(live: Path, environment: dict[str, str]) -> None:
+    log = live / "up.log"
+    assert wait_for(lambda: b"started tracking, depth, recon" in log.read_bytes(), 90), log.read_text()
+    text = log.read_text()
+    assert "tracking, because POSE is missing and recon needs it" in text
+    table = subprocess.run(
+        [sys.executable, "-m", "sf_bringup.graph_table", "--json"],
+        env=environment, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert table.returncode == 0, table.stdout + table.stderr
+    found = json.loads(table.stdout)
+    assert {"/sf/tracking", "/sf/depth", "/sf/recon", "/sf_orchestrator"} <= set(found["nodes"])
+    for topic in ("/sf/tracking/pose", "/sf/depth/dense/variance", "/sf/recon/surface", "/sf/line", "/diagnostics"):
+        assert topic in found["topics"]
+    # A node that dies comes back, and the others stay.
+    (victim,) = [p for p in ours("sf_depth.node") if str(live).encode() in Path(f"/proc/{p}/cmdline").read_bytes()]
+    others = set(ours("sf_tracking.node"))
+    os.kill(victim, signal.SIGKILL)
+    assert wait_for(lambda: b"node depth restarted" in log.read_bytes(), 60), log.read_text()
+    assert set(ours("sf_tracking.node")) == others
