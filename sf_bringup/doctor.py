@@ -37,10 +37,11 @@ def _ros() -> Check:
     try:
         import rclpy
 
-        with rclpy.init():
-            node = rclpy.create_node("sf_doctor")
-            names = node.get_node_names()
-            node.destroy_node()
+        rclpy.init()
+        node = rclpy.create_node("sf_doctor")
+        names = node.get_node_names()
+        node.destroy_node()
+        rclpy.try_shutdown()
     except Exception as error:  # whatever stops DDS is the finding
         return Check("ros graph", False, f"{error}; install the RMW: pip install 'ros-jazzy-rclpy[fastrtps]'")
     domain = os.environ.get("ROS_DOMAIN_ID", "0")

@@ -60,8 +60,11 @@ def main(args: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--seconds", type=float, default=3.0)
     given = parser.parse_args(args)
-    with rclpy.init():
+    rclpy.init()
+    try:
         table = look(given.seconds)
+    finally:
+        rclpy.try_shutdown()
     if given.json:
         print(json.dumps({"nodes": table.nodes, "topics": table.topics, "departures": table.departures}))
     else:

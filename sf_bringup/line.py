@@ -19,7 +19,12 @@ from sf_bringup.wiring import NodeLaunch
 from sf_interfaces.errors import ConfigError, SceneFactoryError
 
 _START_S = 60.0  # importing torch on a busy machine takes a while
-_TRANSITION_S = 30.0
+_TRANSITION_S = 60.0
+_ANSWER_S = 5.0
+_TRANSITIONS = (
+    (Transition.TRANSITION_CONFIGURE, State.PRIMARY_STATE_INACTIVE),
+    (Transition.TRANSITION_ACTIVATE, State.PRIMARY_STATE_ACTIVE),
+)
 _BACK_OFF_S = (1.0, 2.0, 4.0)  # before each of the at most three restarts
 
 
@@ -82,16 +87,24 @@ class Line:
             ConfigError: the node refused; the sentence is the node's own.
             SceneFactoryError: it died or did not answer in time.
         """
-        for transition in (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+        for transition, reached in _TRANSITIONS:
             request = ChangeState.Request(transition=Transition(id=transition))
-            answer = self._call(name, "change_state", ChangeState, request)
-            if not answer.success:
-                raise ConfigError(f"node {name} refused to start: {self._running[name].process.last_lines(3)}")
+            deadline = time.monotonic() + _TRANSITION_S
+            # A request can overtake the discovery of the way back, and its answer is then lost: look, and ask again.
+            while (answer := self._call(name, "change_state", ChangeState, request)) is None:
+                if self._state(name) == reached:
+                    break
+                if time.monotonic() > deadline:
+                    log = self._running[name].process.log
+                    raise SceneFactoryError(f"node {name} does not answer its lifecycle services; see {log}")
+            if answer is not None and not answer.success and self._state(name) != reached:
+                said = self._running[name].process.last_lines(3)
+                raise ConfigError(f"node {name} refused to start: {said}")
 
-    def is_active(self, name: str) -> bool:
-        """Whether the node answers and is in its active state."""
-        state = self._call(name, "get_state", GetState, GetState.Request()).current_state
-        return bool(state.id == State.PRIMARY_STATE_ACTIVE)
+    def _state(self, name: str) -> int | None:
+        """Lifecycle state of a node, None if it did not answer."""
+        answer = self._call(name, "get_state", GetState, GetState.Request())
+        return None if answer is None else int(answer.current_state.id)
 
     def dead(self) -> dict[str, int]:
         """Exit codes of nodes that ended."""
@@ -131,6 +144,7 @@ class Line:
         return Process(launch.name, node_command(launch, self._folder), log, self._environment)
 
     def _call(self, name: str, service: str, kind: Any, request: Any) -> Any:
+        """The answer of a node's service, None if none came in time."""
         client = self._node.create_client(kind, f"/sf/{name}/{service}")
         process = self._running[name].process
         try:
@@ -143,9 +157,7 @@ class Line:
                 if time.monotonic() > deadline:
                     raise SceneFactoryError(f"node {name} did not start within {_START_S:g} s; see {process.log}")
             future = client.call_async(request)
-            rclpy.spin_until_future_complete(self._node, future, timeout_sec=_TRANSITION_S)
-            if not future.done():
-                raise SceneFactoryError(f"node {name} does not answer {service}; see {process.log}")
-            return future.result()
+            rclpy.spin_until_future_complete(self._node, future, timeout_sec=_ANSWER_S)
+            return future.result() if future.done() else None
         finally:
             self._node.destroy_client(client)

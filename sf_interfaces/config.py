@@ -92,7 +92,7 @@ class ConfigFile:
             section, _, key = dotted.partition(".")
             if not key:
                 raise ConfigError(f"--set {dotted}={value}: write it as section.key=value")
-            sections.setdefault(section, {})[key] = value
+            sections.setdefault(section, {})[key] = yaml.safe_load(value)
         return ConfigFile(sections)
 
     def build(self, section: str, cls: type[C]) -> C:
