@@ -12,13 +12,15 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.progress import Progress
 from sf_bringup.result_writer import ResultWriter
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import sync_values
-from sf_interfaces.blocks import BlockSpec
+from sf_interfaces.blocks import BlockSpec, Quantity
 from sf_interfaces.config import ConfigFile, build
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.io.bag import BagReader
@@ -57,13 +59,14 @@ def load_map(path: Path) -> Any:
 class ProductionLine:
     """Parts in the order of the plan; each maps what it gets to what it completes."""
 
-    def __init__(self, blocks: Sequence[str], config: ConfigFile, writer: ResultWriter) -> None:
+    def __init__(self, blocks: Sequence[str], config: ConfigFile, writer: ResultWriter, *, posed: bool) -> None:
         parts = {block: make_part(block, config) for block in blocks}
         self._flexion = parts.get("flexion")
         self.tracker = parts.get("tracking")
         self._completer = parts.get("depth:complete")
         self.reconstruction = parts.get("recon")
         self._writer, self._config, self._epoch = writer, config, 0
+        writer.posed = "tracking" in blocks or posed
         self.keyframe_poses: list[tuple[int, Float64]] = []
 
     def in_epoch(self, epoch: int) -> None:
@@ -88,10 +91,12 @@ class ProductionLine:
             self._writer.tracked(frame, update)
             self._finish_keyframes(update.keyframes)
             return update.T_map_camera if update.scale is Scale.METRIC else None
-        if frame.T_map_camera is not None and frame.image is not None and frame.camera is not None:
+        if frame.image is not None and frame.camera is not None:
+            # Completion of single frames needs no pose; such keyframes stay in their own optical frame.
+            T = np.eye(4) if frame.T_map_camera is None else frame.T_map_camera
             sparse = frame.sparse_depth
             depth = frame.depth if sparse is None else sparse.to_map(frame.camera.height, frame.camera.width)
-            keyframe = Keyframe(frame.stamp_ns, frame.camera, frame.image, frame.T_map_camera, depth)
+            keyframe = Keyframe(frame.stamp_ns, frame.camera, frame.image, T, depth)
             self._writer.keyframe(keyframe)
             self._complete(keyframe)
         return None
@@ -143,7 +148,7 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
         ResultWriter(SequenceWriter(folder.result)) as writer,
         Progress("running", "frames") as progress,
     ):
-        line = ProductionLine(made.ids, config, writer)
+        line = ProductionLine(made.ids, config, writer, posed=Quantity.POSE in made.available)
         done = 0
         for raw in reader.messages(list(kinds)):
             inputs.push(kinds[raw.topic], reader.decode(raw))

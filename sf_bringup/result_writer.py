@@ -17,6 +17,7 @@ class ResultWriter:
     def __init__(self, writer: SequenceWriter) -> None:
         self._writer = writer
         self.counts: dict[str, int] = {}
+        self.posed = True  # False: frames are completed one by one, and no pose is known or written
 
     def __enter__(self) -> ResultWriter:
         return self
@@ -50,7 +51,8 @@ class ResultWriter:
         w = self._writer
         w.image(topics.KEYFRAME_IMAGE.name, stamp, keyframe.image, frame_id)
         w.camera_info(topics.KEYFRAME_INFO.name, stamp, keyframe.camera)
-        w.pose(topics.KEYFRAME_POSE.name, stamp, keyframe.T_map_camera, "map")
+        if self.posed:
+            w.pose(topics.KEYFRAME_POSE.name, stamp, keyframe.T_map_camera, "map")
         if keyframe.depth is not None:
             w.depth(topics.KEYFRAME_DEPTH.name, stamp, keyframe.depth, frame_id, "32FC1")
         if keyframe.landmarks is not None:
@@ -67,7 +69,8 @@ class ResultWriter:
         if depth.variance is not None:
             w.variance(topics.DENSE_VARIANCE.name, stamp, depth, frame_id)
         w.camera_info(topics.DENSE_INFO.name, stamp, keyframe.camera)
-        w.pose(topics.DENSE_POSE.name, stamp, keyframe.T_map_camera, "map")
+        if self.posed:
+            w.pose(topics.DENSE_POSE.name, stamp, keyframe.T_map_camera, "map")
 
     def surface(self, stamp_ns: int, cloud: PointCloud) -> None:
         """The coloured points that a keyframe added to the surface."""

@@ -11,6 +11,7 @@ from sf_bringup.planner import INPUT, Plan, Step
 from sf_interfaces import topics
 from sf_interfaces.blocks import Quantity
 from sf_interfaces.config import ConfigFile
+from sf_interfaces.errors import PlanError
 
 Q = Quantity
 _ROLE_TOPIC = {
@@ -65,6 +66,11 @@ def launches(
         out: folder for the nodes' files, empty for none.
     """
     plan.check_runnable()
+    first = plan.steps[0]
+    if first.spec.name == "depth" and Q.POSE not in plan.available:
+        raise PlanError(
+            "single frames without poses are completed in one process: leave --engine ros out, or use --goal recon"
+        )
     return tuple(_launch(plan, step, roles, config, lossless, out) for step in plan.steps)
 
 
