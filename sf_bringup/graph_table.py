@@ -15,6 +15,9 @@ from rclpy.node import Node
 from sf_interfaces import topics
 
 
+_PATIENCE_S = 20.0
+
+
 @dataclass(frozen=True, slots=True)
 class GraphTable:
     """What was found: nodes, topic -> type, and every departure from ``sf_interfaces/topics.py`` in words."""
@@ -42,15 +45,25 @@ def departures(found: dict[str, str], nodes: tuple[str, ...]) -> list[str]:
 
 
 def look(seconds: float = 3.0) -> GraphTable:
-    """Listen for a while and list the graph (rclpy has to be initialised)."""
+    """Listen for at least ``seconds`` and list the graph (rclpy has to be initialised).
+
+    Names of nodes are discovered later than their topics: as long as a topic seems to have no place in the
+    table, it goes on listening, at most ``_PATIENCE_S``.
+    """
     node = Node("sf_graph_table")
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
+    begin = time.monotonic()
+    table = _list(node)
+    while (passed := time.monotonic() - begin) < seconds or (table.departures and passed < _PATIENCE_S):
         rclpy.spin_once(node, timeout_sec=0.1)
+        table = _list(node)
+    node.destroy_node()
+    return table
+
+
+def _list(node: Node) -> GraphTable:
     names = sorted(f"{space.rstrip('/')}/{name}" for name, space in node.get_node_names_and_namespaces())
     nodes = tuple(n for n in names if n != "/sf_graph_table")
     found = {name: kinds[0] for name, kinds in node.get_topic_names_and_types()}
-    node.destroy_node()
     return GraphTable(nodes, found, tuple(departures(found, nodes)))
 
 

@@ -17,6 +17,9 @@ setup(
         (f"share/{NAME}", ["package.xml"]),
     ],
     entry_points={
+        # sf_recon is an ament_cmake package, which declares no entry points of its own.
+        "scenefactory.blocks": ["recon = sf_recon.block:SPEC"],
+        "scenefactory.parts": ["recon = sf_recon.block:make"],
         "console_scripts": ["sf = sf_bringup.cli:main"],
     },
 )

@@ -18,6 +18,7 @@ setup(
     ],
     entry_points={
         "scenefactory.blocks": ["depth = sf_depth.block:SPECS"],
+        "scenefactory.parts": ["depth:complete = sf_depth.block:make"],
         "console_scripts": ["node = sf_depth.node:main"],
     },
 )

@@ -18,6 +18,7 @@ setup(
     ],
     entry_points={
         "scenefactory.blocks": ["flexion = sf_flexion.block:SPEC"],
+        "scenefactory.parts": ["flexion = sf_flexion.block:make"],
         "console_scripts": ["node = sf_flexion.node:main"],
     },
 )

@@ -18,6 +18,7 @@ setup(
     ],
     entry_points={
         "scenefactory.blocks": ["tracking = sf_tracking.block:SPEC"],
+        "scenefactory.parts": ["tracking = sf_tracking.block:make"],
         "console_scripts": ["node = sf_tracking.node:main"],
     },
 )
