@@ -14,7 +14,6 @@ from rclpy.node import Node
 
 from sf_interfaces import topics
 
-
 _PATIENCE_S = 20.0
 
 
