@@ -24,8 +24,11 @@ lint: $(READY)
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
 
+# DATA=folder of the real recordings adds the comparison of completion methods.
 bench: $(READY)
-	@set -e; for script in benchmarks/bench_*.py; do echo "== $$script"; $(PY) "$$script"; done
+	$(PY) benchmarks/rasterize.py
+	$(PY) benchmarks/play_record.py
+	$(if $(DATA),$(PY) benchmarks/completion.py --data $(DATA))
 
 clean:
 	rm -rf $(VENV) build dist out demo install log .pytest_cache .mypy_cache .ruff_cache .hypothesis
