@@ -23,8 +23,9 @@ _INTERRUPT_S, _TERMINATE_S = 1.5, 1.0  # together below the 3 s in which everyth
 _LIBC = ctypes.CDLL(None) if sys.platform == "linux" else None  # loaded before the fork
 
 
-def _die_with_parent() -> None:
-    """In the child: ask Linux for SIGTERM when the parent dies, even by SIGKILL."""
+def _in_child(nice: int) -> None:
+    """Give way by ``nice``, and ask Linux for SIGTERM when the parent dies, even by SIGKILL."""
+    os.nice(nice)
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
 
@@ -36,7 +37,12 @@ class Process:
     """
 
     def __init__(
-        self, name: str, command: Sequence[str], log: Path, environment: Mapping[str, str] | None = None
+        self,
+        name: str,
+        command: Sequence[str],
+        log: Path,
+        environment: Mapping[str, str] | None = None,
+        nice: int = 0,
     ) -> None:
         self.name, self.log = name, log
         log.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +54,7 @@ class Process:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                preexec_fn=_die_with_parent,
+                preexec_fn=lambda: _in_child(nice),
             )
 
     @property

@@ -21,6 +21,7 @@ from sf_interfaces.errors import ConfigError, SceneFactoryError
 _START_S = 60.0  # importing torch on a busy machine takes a while
 _TRANSITION_S = 60.0
 _ANSWER_S = 5.0
+_NICE = 10
 _TRANSITIONS = (
     (Transition.TRANSITION_CONFIGURE, State.PRIMARY_STATE_INACTIVE),
     (Transition.TRANSITION_ACTIVATE, State.PRIMARY_STATE_ACTIVE),
@@ -141,7 +142,9 @@ class Line:
 
     def _spawn(self, launch: NodeLaunch) -> Process:
         log = self._folder / f"{launch.name}.log"
-        return Process(launch.name, node_command(launch, self._folder), log, self._environment)
+        # What follows the sensors can catch up later; the head cannot, and so goes first where cores are scarce.
+        nice = 0 if launch.head else _NICE
+        return Process(launch.name, node_command(launch, self._folder), log, self._environment, nice)
 
     def _call(self, name: str, service: str, kind: Any, request: Any) -> Any:
         """The answer of a node's service, None if none came in time."""

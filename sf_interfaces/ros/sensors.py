@@ -13,7 +13,8 @@ from sf_interfaces.sync import FrameAssembler, SyncConfig
 from sf_interfaces.topics import Topic
 
 _LIVE_WAIT_S = 0.3  # stream time a live image waits for its companions
-_KEEP = {"image": 2, "depth": 4, "lidar": 3, "pose": 400}  # live: messages held, latest wins
+# Live: messages held, then the latest wins. Deep enough for a second of jitter on a busy machine.
+_KEEP = {"image": 20, "depth": 20, "lidar": 20, "pose": 400}
 
 
 class SensorInputs:
