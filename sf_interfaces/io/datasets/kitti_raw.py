@@ -110,12 +110,13 @@ class _Oxts:
 
     def camera_pose(self, number: int, stamp: int) -> Float64 | None:
         """T_map_camera at a time near the packet of this number."""
-        if number >= min(len(self._files), len(self._stamps)):
+        count = min(len(self._files), len(self._stamps))
+        if number < count and stamp == self._stamps[number]:
+            return self._pose(number) @ self._T_imu_camera
+        a = number if number < count and stamp > self._stamps[number] else number - 1
+        b = a + 1
+        if a < 0 or b >= count:
             return None
-        other = number + (1 if stamp >= self._stamps[number] else -1)
-        if not 0 <= other < min(len(self._files), len(self._stamps)):
-            return None
-        a, b = sorted((number, other))
         t0, t1 = self._stamps[a], self._stamps[b]
         if not t0 <= stamp <= t1 or t1 - t0 > _LONGEST_OXTS_GAP_NS:
             return None
