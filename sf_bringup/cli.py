@@ -192,6 +192,12 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--depth-scale", type=float, metavar="N", help="stored depth units in a metre, if not its own")
 
 
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("out", type=Path)
+    _add_reading(parser)
+
+
 def _add_input(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "input",
@@ -238,10 +244,7 @@ def build_parser() -> argparse.ArgumentParser:
     for name, (_, help) in PASSED_ON.items():
         verbs.add_parser(name, help=help, add_help=False)
 
-    p = verb("convert", _convert, "write a data set as an mcap bag")
-    p.add_argument("dataset", type=Path)
-    p.add_argument("out", type=Path)
-    _add_reading(p)
+    _add_convert(verb("convert", _convert, "write a data set as an mcap bag"))
 
     p = verb("simulate", _simulate, "write a bag with exact ground truth from a procedural scene")
     from sf_bringup.simulate_command import add_arguments
