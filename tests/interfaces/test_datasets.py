@@ -127,6 +127,11 @@ def _scaled(text: str) -> str:
     return layouts.numbers(values)
 
 
+def _nan_row(text: str) -> str:
+    rows = text.splitlines()
+    return "\n".join([rows[0], "nan " + rows[1].partition(" ")[2], *rows[2:]])
+
+
 @pytest.mark.parametrize(
     ("make", "file", "spoil", "says"),
     [
@@ -139,6 +144,7 @@ def _scaled(text: str) -> str:
         (layouts.seven_scenes, "frame-000001.pose.txt", lambda f: f.write_text("1 0 0"), "must hold 4x4"),
         (layouts.seven_scenes, "frame-000001.color.jpg", Path.unlink, "missing"),
         (layouts.kitti_odometry, "velodyne/000001.bin", Path.unlink, "missing"),
+        (layouts.kitti_odometry, "../../poses/04.txt", _write_text(_nan_row), "not finite"),
         (layouts.kitti_odometry, "velodyne/000001.bin", lambda f: f.write_bytes(b"12345"), "four floats"),
         (layouts.kitti_raw, "oxts/data/0000000001.txt", lambda f: f.write_text("49 8 nan 0 0 0"), "lat, lon"),
         (layouts.kitti_stereo, "gt/disp_occ_0/000001.png", _write_depth(0.1, np.uint8), "16 bit"),
@@ -154,7 +160,8 @@ def test_other_bad_files_are_named_or_left_out(
 ) -> None:
     path = make(tmp_path / "set", 3)
     spoil(path / file)
-    with pytest.raises(SceneFactoryError, match=rf"(?s){Path(file).name}.*{says}|{says}.*{Path(file).name}"):
+    name = Path(file).name
+    with pytest.raises(SceneFactoryError, match=rf"{name}.*{says}|{says}.*{name}"):
         convert(path, tmp_path / "out.mcap")
     _, written = convert(path, tmp_path / "out.mcap", skip_bad=True)
     assert (written.frames, written.skipped) == (2, 1)
@@ -183,6 +190,13 @@ def test_what_all_frames_need_is_named_and_never_skipped(
     (path / file).write_text(content)
     with pytest.raises(SceneFactoryError, match=says):
         convert(path, tmp_path / "out.mcap", skip_bad=True)
+
+
+def test_depth_of_another_size_is_named_by_its_image(tmp_path: Path) -> None:
+    path = layouts.replica(tmp_path / "set", 2)
+    layouts.depth(path / "results/depth000001.png", 6553.5, (24, 16))
+    with pytest.raises(FormatError, match=r"depth of image .*frame000001\.jpg is 24x16, the image 48x32"):
+        convert(path, tmp_path / "out.mcap")
 
 
 def test_depth_scale_replaces_the_layouts_own(tmp_path: Path) -> None:

@@ -18,8 +18,7 @@ import numpy as np
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.io.datasets.dataset import LIDAR, OPTICAL, PHOTO_NS, START_NS, Dataset, Reader, Sample
-from sf_interfaces.io.datasets.files import as_depth, images_in, read_image, read_numbers, read_rgb, read_sweep
-from sf_interfaces.io.trajectory import read_kitti
+from sf_interfaces.io.datasets.files import as_depth, images_in, read_image, read_numbers, read_rgb, read_sweep, rigid
 from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
 
 
@@ -143,14 +142,15 @@ class KittiOdometry(Dataset):
             raise FormatError(f"{sequence} has {len(self._images)} images but {len(seconds)} times; copy it again")
         places = (sequence.parent.parent / "poses" / f"{sequence.name}.txt", sequence / "poses.txt")
         file = next((place for place in places if place.is_file()), None)
-        T_camera_cam0 = self._rig.T_camera_cam0
-        given = np.zeros((0, 4, 4)) if file is None else read_kitti(file).poses
-        poses = T_camera_cam0 @ given @ se3.inverse(T_camera_cam0)
+        rows = np.zeros((0, 3, 4)) if file is None else read_numbers(file, (-1, 3, 4))
         for i, (image, second) in enumerate(zip(self._images, seconds.tolist(), strict=False)):
-            yield partial(self._sample, image, START_NS + round(second * 1e9), poses[i] if i < len(poses) else None)
+            pose = (rows[i], file) if file is not None and i < len(rows) else None
+            yield partial(self._sample, image, START_NS + round(second * 1e9), pose)
 
-    def _sample(self, file: Path, stamp: int, pose: Float64 | None) -> Sample:
+    def _sample(self, file: Path, stamp: int, row: tuple[Float64, Path] | None) -> Sample:
         image = read_rgb(file)
+        T = self._rig.T_camera_cam0
+        pose = None if row is None else T @ rigid(*row) @ se3.inverse(T)
         folder = self._sequence / "velodyne"
         sweep = read_sweep(folder / f"{file.stem}.bin") if folder.is_dir() else None
         return Sample(stamp, file, image, self._rig.camera(image), sweep=sweep, pose=pose)

@@ -79,6 +79,12 @@ class _Sizes:
                 f"image {sample.file} is {size[1]}x{size[0]} but {first.file.name} is "
                 f"{first.image.shape[1]}x{first.image.shape[0]}; put images of other sizes in a folder of their own"
             )
+        for depth in (sample.depth, sample.reference_depth):
+            if depth is not None and depth.z.shape != size:
+                raise FormatError(
+                    f"depth of image {sample.file} is {depth.z.shape[1]}x{depth.z.shape[0]}, the image {size[1]}x"
+                    f"{size[0]}; register depth to the image first"
+                )
         if sample.camera is not None:
             camera = sample.camera
             if (camera.height, camera.width) != size:
