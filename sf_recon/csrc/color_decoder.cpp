@@ -89,20 +89,29 @@ SF_SIMD void weigh(int k, float inverse_sigma, Lanes& near) {
         for (int i = 0; i < kLanes; ++i) near.distance2[j][i] /= sum[i] > 1e-12f ? sum[i] : 1e-12f;
 }
 
-SF_SIMD void blend(const Lanes& near, int lanes, int k, const float* table, size_t rows, size_t columns, float* out,
+// out [lanes, columns] = weighted rows of the neighbours; a neighbour whose row is not there yet is left out.
+SF_SIMD void blend(const Lanes& near, int k, const float* table, size_t rows, size_t columns, float* out,
                    size_t stride) {
-    for (int i = 0; i < lanes; ++i) {
+    for (int i = 0; i < kLanes; ++i) {
         float* sum = out + i * stride;
-        for (size_t c = 0; c < columns; ++c) sum[c] = 0.0f;
+        const float* row[kMaxK];
+        float weight[kMaxK];
+        int found = 0;
         for (int j = 0; j < k; ++j) {
-            const size_t id = static_cast<size_t>(near.id[j][i]);
-            if (id >= rows) continue;  // none, or a point whose row is not there yet
-            const float w = near.distance2[j][i];
-            const float* row = table + id * columns;
-            size_t c = 0;
-            for (; c + 8 <= columns; c += 8)
-                for (size_t b = 0; b < 8; ++b) sum[c + b] += w * row[c + b];
-            for (; c < columns; ++c) sum[c] += w * row[c];
+            const size_t id = static_cast<size_t>(near.id[j][i]);  // -1 becomes huge
+            row[found] = table + (id < rows ? id : 0) * columns, weight[found] = near.distance2[j][i];
+            found += id < rows;
+        }
+        size_t c = 0;
+        for (; c + 8 <= columns; c += 8) {
+            Float8 total = {};
+            for (int j = 0; j < found; ++j) total += weight[j] * load8(row[j] + c);
+            std::memcpy(sum + c, &total, sizeof(total));
+        }
+        for (; c < columns; ++c) {
+            float total = 0.0f;
+            for (int j = 0; j < found; ++j) total += weight[j] * row[j][c];
+            sum[c] = total;
         }
     }
 }
@@ -159,10 +168,10 @@ class Decoder {
             for (int first = 0; first < kGroup; first += kLanes) {
                 Lanes& near = scratch_.near[first / kLanes];
                 weigh(net_.neighbours, level.inverse_sigma, near);
-                blend(near, kLanes, net_.neighbours, level.features, level.rows, level.columns,
+                blend(near, net_.neighbours, level.features, level.rows, level.columns,
                       scratch_.rows.data() + first * encoded_ + column, encoded_);
                 if (column == 0 && net_.base)
-                    blend(near, kLanes, net_.neighbours, net_.base, net_.base_rows, 3, scratch_.base[first], 3);
+                    blend(near, net_.neighbours, net_.base, net_.base_rows, 3, scratch_.base[first], 3);
             }
             column += level.columns;
         }
@@ -197,12 +206,14 @@ class Decoder {
         }
     }
 
+    GridCursor& cursor(const FieldLevel& level) { return cursors_[&level - net_.levels.data()]; }
+
     // Every member is within `spread` of the centre, so its K nearest are within (K-th distance + 2 spread) of it.
     bool collect(const FieldLevel& level, const float* centre, float spread) {
         int32_t ids[kMaxK];
         float distance2[kMaxK];
         const float widest = (level.radius + spread) * 1.0001f;
-        level.grid->query(centre, net_.neighbours, widest, ids, distance2);
+        cursor(level).query(centre, scratch_.order, 1, net_.neighbours, widest, ids, distance2);
         const float kth = std::sqrt(distance2[net_.neighbours - 1]);
         return level.grid->collect(centre, std::min(widest, (kth + 2 * spread) * 1.0001f), scratch_.candidates);
     }
@@ -212,7 +223,7 @@ class Decoder {
         for (int i = first; i < first + count; ++i) {
             scratch_.points[3 * i] = g.x[i], scratch_.points[3 * i + 1] = g.y[i], scratch_.points[3 * i + 2] = g.z[i];
         }
-        cursors_[&level - net_.levels.data()].query(scratch_.points, scratch_.order + first, count, k, level.radius, scratch_.ids,
+        cursor(level).query(scratch_.points, scratch_.order + first, count, k, level.radius, scratch_.ids,
                                                     scratch_.distance2);
         for (int i = first; i < first + count; ++i) {
             Lanes& near = scratch_.near[i / kLanes];

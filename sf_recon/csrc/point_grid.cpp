@@ -112,6 +112,7 @@ int32_t PointGrid::new_block(int32_t next) {
     const int32_t b = static_cast<int32_t>(next_.size());
     if (b % kPage == 0) pages_.emplace_back(new Block[kPage]);
     next_.push_back(next);
+    filled_.push_back(0);
     Block& fresh = pages_[b / kPage][b % kPage];
     for (int i = 0; i < kBlock; ++i) {
         fresh.x[i] = kInfinity;
@@ -122,15 +123,15 @@ int32_t PointGrid::new_block(int32_t next) {
 }
 
 void PointGrid::add(const float* p) {
-    const size_t cell = cells_.insert(cell_of(p, inverse_));
-    if (cell == chains_.size()) chains_.push_back({new_block(-1), 0});
-    Chain& chain = chains_[cell];
-    if (chain.count == kBlock) chain = {new_block(chain.block), 0};
-    Block& block = pages_[chain.block / kPage][chain.block % kPage];
-    block.x[chain.count] = p[0];
-    block.y[chain.count] = p[1];
-    block.z[chain.count] = p[2];
-    block.id[chain.count++] = count_++;
+    const Cell cell = cell_of(p, inverse_);
+    const size_t brick = index_.insert(brick_of(cell));
+    if (brick == bricks_.size()) std::fill_n(bricks_.emplace_back().newest, 64, -1);
+    int32_t& b = bricks_[brick].newest[in_brick(cell)];
+    if (b < 0 || filled_[b] == kBlock) b = new_block(b);
+    Block& block = pages_[b / kPage][b % kPage];
+    const int lane = filled_[b]++;
+    block.x[lane] = p[0], block.y[lane] = p[1], block.z[lane] = p[2];
+    block.id[lane] = count_++;
 }
 
 void PointGrid::add_spaced(const float* points, size_t n, float spacing, float copy_radius,
@@ -148,25 +149,18 @@ void PointGrid::add_spaced(const float* points, size_t n, float spacing, float c
     }
 }
 
-int32_t PointGrid::chain(Cell cell) const {
-    const int32_t found = cells_.find(cell);
-    return found < 0 ? -1 : chains_[found].block;
+int32_t PointGrid::newest(Cell cell) const {
+    const int32_t brick = index_.find(brick_of(cell));
+    return brick < 0 ? -1 : bricks_[brick].newest[in_brick(cell)];
 }
 
 SF_INLINE void PointGrid::visit(int32_t first, const float* p, Best& best) const {
     for (int32_t b = first; b >= 0; b = next_[b]) {
         const Block& points = block(b);
-        float d2[kBlock];
-        int32_t inside[kBlock];
-        for (int i = 0; i < kBlock; ++i) {
-            const float dx = points.x[i] - p[0], dy = points.y[i] - p[1], dz = points.z[i] - p[2];
-            d2[i] = dx * dx + dy * dy + dz * dz;
-            inside[i] = d2[i] <= best.bound ? 1 << i : 0;
-        }
-        int32_t mask = 0;
-        for (int i = 0; i < kBlock; ++i) mask |= inside[i];
-        for (; mask; mask &= mask - 1) {
-            const int i = __builtin_ctz(static_cast<unsigned>(mask));
+        const Float8 dx = load8(points.x) - p[0], dy = load8(points.y) - p[1], dz = load8(points.z) - p[2];
+        const Float8 d2 = dx * dx + dy * dy + dz * dz;
+        for (uint32_t mask = lanes_set(d2 <= best.bound); mask; mask &= mask - 1) {
+            const int i = __builtin_ctz(mask);
             best.offer(d2[i], points.id[i]);
         }
     }
@@ -195,7 +189,7 @@ void PointGrid::search_rings(const float* p, float radius, Cell home, Best& best
                 for (int dz = -ring; dz <= ring; dz += face ? 1 : 2 * ring) {
                     const float gz = gap(2, dz);
                     if (gxy2 + gz * gz > best.bound) continue;
-                    const int32_t first = chain({home.x + dx, home.y + dy, home.z + dz});
+                    const int32_t first = newest({home.x + dx, home.y + dy, home.z + dz});
                     if (first >= 0) visit(first, p, best);
                 }
             }
@@ -209,7 +203,7 @@ void PointGrid::query(const float* p, int k, float radius, int32_t* ids, float* 
     Best best(k, radius);
     for (const auto& o : kOffsets) {
         if (gaps.to(o) > best.bound) continue;
-        const int32_t first = chain({home.x + o[0], home.y + o[1], home.z + o[2]});
+        const int32_t first = newest({home.x + o[0], home.y + o[1], home.z + o[2]});
         if (first >= 0) visit(first, p, best);
     }
     search_rings(p, radius, home, best);
@@ -222,8 +216,19 @@ const GridCursor::Around& GridCursor::around(Cell home) {
     Around& slot = around_[mixed % kSlots];
     if (same(slot.home, home)) return slot;
     slot.home = home, slot.count = 0;
+    const Cell low = PointGrid::brick_of({home.x - 1, home.y - 1, home.z - 1});
+    const Cell high = PointGrid::brick_of({home.x + 1, home.y + 1, home.z + 1});
+    const PointGrid::Brick* bricks[2][2][2] = {};
+    for (int x = 0; x <= high.x - low.x; ++x)
+        for (int y = 0; y <= high.y - low.y; ++y)
+            for (int z = 0; z <= high.z - low.z; ++z) {
+                const int32_t found = grid_->index_.find({low.x + x, low.y + y, low.z + z});
+                if (found >= 0) bricks[x][y][z] = &grid_->bricks_[found];
+            }
     for (const auto& o : kOffsets) {
-        const int32_t first = grid_->chain({home.x + o[0], home.y + o[1], home.z + o[2]});
+        const Cell cell{home.x + o[0], home.y + o[1], home.z + o[2]}, b = PointGrid::brick_of(cell);
+        const PointGrid::Brick* brick = bricks[b.x - low.x][b.y - low.y][b.z - low.z];
+        const int32_t first = brick ? brick->newest[PointGrid::in_brick(cell)] : -1;
         if (first < 0) continue;
         slot.first[slot.count] = first;
         std::copy(o, o + 3, slot.offset[slot.count++]);
@@ -287,14 +292,14 @@ SF_SIMD bool PointGrid::collect(const float* p, float radius, Candidates& out) c
     for (int32_t x = low.x; x <= high.x; ++x)
         for (int32_t y = low.y; y <= high.y; ++y)
             for (int32_t z = low.z; z <= high.z; ++z)
-                for (int32_t b = chain({x, y, z}); b >= 0; b = next_[b]) {
+                for (int32_t b = newest({x, y, z}); b >= 0; b = next_[b]) {
                     const Block& points = block(b);
                     if (out.count + kBlock > Candidates::kCapacity) return false;
-                    for (int i = 0; i < kBlock; ++i) {  // without a branch: the next one overwrites a rejected one
-                        const float dx = points.x[i] - p[0], dy = points.y[i] - p[1], dz = points.z[i] - p[2];
+                    const Float8 dx = load8(points.x) - p[0], dy = load8(points.y) - p[1], dz = load8(points.z) - p[2];
+                    for (uint32_t m = lanes_set(dx * dx + dy * dy + dz * dz <= radius2); m; m &= m - 1) {
+                        const int i = __builtin_ctz(m);
                         out.x[out.count] = points.x[i], out.y[out.count] = points.y[i], out.z[out.count] = points.z[i];
-                        out.id[out.count] = points.id[i];
-                        out.count += dx * dx + dy * dy + dz * dz <= radius2;
+                        out.id[out.count++] = points.id[i];
                     }
                 }
     return true;

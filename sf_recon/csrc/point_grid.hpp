@@ -56,22 +56,25 @@ class PointGrid {
         float x[kBlock], y[kBlock], z[kBlock];
         int32_t id[kBlock];
     };
-    struct Chain {  // of blocks of one cell, newest first
-        int32_t block, count;  // the newest, and how many points it holds
+    struct Brick {  // newest block of each of 4 x 4 x 4 cells, or -1: neighbouring cells share a look-up
+        int32_t newest[64];
     };
     struct Best;
 
     const Block& block(int32_t b) const { return pages_[b / kPage][b % kPage]; }
-    int32_t chain(Cell cell) const;
+    static Cell brick_of(Cell c) { return {c.x >> 2, c.y >> 2, c.z >> 2}; }
+    static int in_brick(Cell c) { return (c.x & 3) << 4 | (c.y & 3) << 2 | (c.z & 3); }
+    int32_t newest(Cell cell) const;
     int32_t new_block(int32_t next);
     void visit(int32_t first, const float* point, Best& best) const;
     void search_rings(const float* point, float radius, Cell home, Best& best) const;
 
     float size_, inverse_;
-    CellMap cells_;
-    std::vector<Chain> chains_;
+    CellMap index_;  // of the bricks
+    std::vector<Brick> bricks_;
     std::vector<std::unique_ptr<Block[]>> pages_;  // growth never moves a block
-    std::vector<int32_t> next_;                    // block after each block, or -1
+    std::vector<int32_t> next_;                    // block after each block in its cell, or -1
+    std::vector<uint8_t> filled_;                  // lanes of each block
     int32_t count_ = 0;
     mutable std::shared_mutex mutex_;
 };
@@ -87,7 +90,7 @@ class GridCursor {
                float* distance2);
 
    private:
-    static constexpr size_t kSlots = 16;
+    static constexpr size_t kSlots = 64;
     struct Around {  // the occupied ones of a cell and its 26 neighbours, home and then faces, edges, corners
         Cell home{kCellLimit, 0, 0};
         int count = 0;

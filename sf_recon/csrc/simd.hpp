@@ -26,6 +26,20 @@ SF_INLINE int32_t to_bits(float value) {
     return bits;
 }
 
+typedef float Float8 __attribute__((vector_size(32), aligned(4)));
+typedef int32_t Int8 __attribute__((vector_size(32), aligned(4)));
+
+SF_INLINE const Float8& load8(const float* values) { return *reinterpret_cast<const Float8*>(values); }
+
+// One bit for each lane that a comparison left at -1.
+SF_INLINE uint32_t lanes_set(const Int8& comparison) {
+    const Int8 bits = comparison & Int8{1, 2, 4, 8, 16, 32, 64, 128};
+    uint64_t pairs[4];
+    std::memcpy(pairs, &bits, 32);
+    const uint64_t both = (pairs[0] | pairs[1]) | (pairs[2] | pairs[3]);
+    return static_cast<uint32_t>(both | both >> 32);
+}
+
 // exp(x) for x <= 0 with a relative error below 2e-7; 0 below -87 and for -inf. Free of branches, so that it vectorises.
 SF_INLINE float exp_negative(float x) {
     const float clipped = x > -87.0f ? x : -87.0f;
