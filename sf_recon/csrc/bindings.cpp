@@ -217,23 +217,48 @@ Out<float> decode_image(Image positions, Matrix4 T_map_camera, nb::list levels, 
     return give(std::move(colors), {h, w, 3});
 }
 
-nb::tuple rasterize(Points points, Matrix4 T_camera_map, float fx,
-                    float fy, float cx, float cy, int width, int height, float radius, float near, float max_half,
-                    int k_ray, float layer_gap, float sigma, int threads) {
+// An image to be filled when it is wanted, else nothing.
+template <class T>
+struct Wanted {
+    std::unique_ptr<T[]> data;
+    std::vector<size_t> shape;
+
+    Wanted(bool wanted, std::vector<size_t> shape_) : shape(std::move(shape_)) {
+        size_t size = 1;
+        for (const size_t extent : shape) size *= extent;
+        if (wanted) data.reset(new T[size]);
+    }
+
+    nb::object array() {
+        if (!data) return nb::none();
+        T* raw = data.release();
+        nb::capsule owner(raw, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+        return nb::cast(Out<T>(raw, shape.size(), shape.data(), owner));
+    }
+};
+
+nb::tuple rasterize(Points points, Matrix4 T_camera_map, float fx, float fy, float cx, float cy, int width, int height,
+                    float radius, float near, float max_half, int k_ray, float layer_gap, float sigma,
+                    std::optional<Points> normals, bool position, bool index, bool weight, bool normal, int threads) {
     if (width < 1 || height < 1 || k_ray < 1 || !(near > 0) || !(sigma > 0) || !(max_half >= 0.5f))
         throw nb::value_error("rasterize needs a non-empty image, k_ray >= 1, near > 0, sigma > 0, max_half >= 0.5");
+    if (width > 32768 || height > 32768 || k_ray > 1024 || max_half > 32768 || points.shape(0) > 2000000000)
+        throw nb::value_error("rasterize: at most 32768 pixels a side, k_ray 1024, 2e9 points");
+    if (normals && normals->shape(0) != points.shape(0)) throw nb::value_error("one normal for each point");
     sf::RasterSpec spec{{}, {}, fx, fy, cx, cy, width, height, radius, near, max_half, k_ray, layer_gap, sigma, threads};
     for (int i = 0; i < 3; ++i) {
         for (int j = 0; j < 3; ++j) spec.rotation[3 * i + j] = T_camera_map(i, j);
         spec.translation[i] = T_camera_map(i, 3);
     }
-    const size_t w = width, h = height;
-    std::unique_ptr<float[]> depth(new float[w * h]), position(new float[w * h * 3]);
+    const size_t w = width, h = height, k = k_ray;
+    Wanted<float> z(true, {h, w}), xyz(position, {h, w, 3}), weights(weight, {h, w, k}), n(normal, {h, w, 3});
+    Wanted<int32_t> ids(index, {h, w, k});
     {
         nb::gil_scoped_release release;
-        sf::rasterize(points.data(), points.shape(0), spec, depth.get(), position.get());
+        sf::rasterize(points.data(), normals ? normals->data() : nullptr, points.shape(0), spec,
+                      {z.data.get(), xyz.data.get(), ids.data.get(), weights.data.get(), n.data.get()});
     }
-    return nb::make_tuple(give(std::move(depth), {h, w}), give(std::move(position), {h, w, 3}));
+    return nb::make_tuple(z.array(), xyz.array(), ids.array(), weights.array(), n.array());
 }
 
 }  // namespace
@@ -262,5 +287,7 @@ NB_MODULE(_native, m) {
           nb::arg("threads") = 0);
     m.def("rasterize", &rasterize, nb::arg("points"), nb::arg("T_camera_map"), nb::arg("fx"), nb::arg("fy"),
           nb::arg("cx"), nb::arg("cy"), nb::arg("width"), nb::arg("height"), nb::arg("radius"), nb::arg("near"),
-          nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"), nb::arg("threads") = 0);
+          nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"),
+          nb::arg("normals") = nb::none(), nb::arg("position") = true, nb::arg("index") = false,
+          nb::arg("weight") = false, nb::arg("normal") = false, nb::arg("threads") = 0);
 }
