@@ -124,16 +124,19 @@ def _image(make: Factory, pixels: NDArray[Any], encoding: str, stamp_ns: int, fr
     )
 
 
-def encode_image(make: Factory, image: UInt8, stamp_ns: int, frame_id: str) -> Any:
-    """RGB [H, W, 3] -> rgb8, mono [H, W] -> mono8.
+def encode_image(make: Factory, image: UInt8 | NDArray[np.uint16], stamp_ns: int, frame_id: str) -> Any:
+    """RGB [H, W, 3] uint8 -> rgb8, mono [H, W] -> mono8 (uint8) or mono16 (uint16).
 
     Raises:
-        FormatError: not uint8 of one of these shapes.
+        FormatError: another type or shape.
     """
     image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise FormatError(f"image must be uint8 (H, W) or (H, W, 3), got {image.dtype} {image.shape}")
-    return _image(make, image, "rgb8" if image.ndim == 3 else "mono8", stamp_ns, frame_id)
+    encoding = {("uint8", 3): "rgb8", ("uint8", 2): "mono8", ("uint16", 2): "mono16"}.get(
+        (image.dtype.name, image.ndim)
+    )
+    if encoding is None or (image.ndim == 3 and image.shape[2] != 3):
+        raise FormatError(f"image must be uint8 (H, W) or (H, W, 3), or uint16 (H, W), got {image.dtype} {image.shape}")
+    return _image(make, image, encoding, stamp_ns, frame_id)
 
 
 def encode_depth(make: Factory, depth: DepthMap, stamp_ns: int, frame_id: str, encoding: str = "32FC1") -> Any:
