@@ -89,7 +89,7 @@ class Orchestrator(Node):
         return {
             name: kinds[0]
             for name, kinds in self.get_topic_names_and_types()
-            if discovery.is_input(name) and kinds[0] in discovery.ROLES.values() and self.count_publishers(name)
+            if discovery.is_input(name) and discovery.is_wanted(kinds[0]) and self.count_publishers(name)
         }
 
     def _probe(self, types: dict[str, str]) -> None:
@@ -106,9 +106,7 @@ class Orchestrator(Node):
 
     def _probed(self, name: str) -> Any:
         def take(msg: Any) -> None:
-            depth = messages.is_depth_encoding(msg.encoding)
-            fraction = messages.decode_depth(msg).density if depth else 1.0
-            self._probes[name] = Probe(msg.encoding, msg.header.frame_id, fraction)
+            self._probes[name] = discovery.probe(msg)
 
         return take
 
@@ -118,7 +116,10 @@ class Orchestrator(Node):
             user = {role: topic for role, topic in self._user.items() if topic in types}
             mapping = discovery.discover(types, self._probes, user)
             made = plan(mapping.available, self._goal, load_blocks())
-            wanted = launches(made, mapping.roles, self._config, lossless=self._replay, out=str(self._folder.resolve()))
+            wanted = launches(
+                made, mapping.roles, self._config,
+                lossless=self._replay, out=str(self._folder.resolve()), compressed=mapping.compressed,
+            )  # fmt: skip
         except PlanError as error:
             self._say(f"no line: {error}")
             self._line.apply(())

@@ -42,6 +42,7 @@ class SyncConfig:
     reset_s: float = option(1.0, "a backward jump in time beyond this starts anew, s", low=0.0)
     depth_registered: bool = option(False, "take depth as registered to the image though its frame differs")
     pose_frame: str = option("", "frame whose pose is given, such as base_link (empty: the optical frame)")
+    compressed: tuple[str, ...] = option((), "streams that arrive as CompressedImage: image, depth")
     extrinsic: tuple[float, ...] = option((), "T_camera_lidar as x y z qx qy qz qw (empty: from /tf_static)")
 
     @property

@@ -50,6 +50,8 @@ class SensorInputs:
             ("image", topics.RGB_IMAGE, config.image),
         ):
             if wanted:
+                if kind in config.compressed:
+                    topic = replace(topic, type=messages.COMPRESSED_IMAGE)
                 yield topic, kind, None if self._lossless else _KEEP[kind]
 
     def push(self, kind: str, msg: Any) -> None:
