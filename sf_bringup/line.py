@@ -82,8 +82,10 @@ class Line:
         for name in started:
             self._running[name] = _Running(plan[name], self._spawn(plan[name]), since=time.monotonic())
         self._running = {n: self._running[n] for n in plan}
-        # Consumers first: when a head becomes active, everybody downstream already listens.
-        for name in reversed(started):
+        # A replay waits for nobody: everybody downstream has to listen before its head becomes active. A live
+        # head is wanted soon, and its keyframes are kept for those that come later.
+        replay = any(launch.parameters.get("lossless") for launch in plan.values())
+        for name in reversed(started) if replay else started:
             self.bring_up(name)
         return started, stopped
 

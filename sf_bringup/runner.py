@@ -23,7 +23,6 @@ from sf_interfaces.blocks import load_blocks
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import ConfigError
 
-SECTIONS = {"tracking", "depth", "recon", "flexion", "sync"}
 _VERSIONED = (
     "scenefactory",
     "numpy",
@@ -120,7 +119,7 @@ def run(request: RunRequest) -> Summary:
     if any(step.sources.get(q) == "input" for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
         preflight.check_extrinsic(given)
     config = ConfigFile.load(request.config, request.overrides)
-    config.check_sections(SECTIONS)
+    config.check_sections({spec.name for spec in load_blocks()} | {"sync", "hosts"})
     folder = RunFolder(request.out)
     _write_facts(folder, request, given, made, config)
     started = time.monotonic()

@@ -45,3 +45,7 @@ def sweep_shared_memory(folder: Path = _FOLDER) -> int:
         segment.unlink(missing_ok=True)
         segment.with_name(segment.name + _LOCK).unlink(missing_ok=True)
     return len(orphans)
+
+
+if __name__ == "__main__":
+    print(f"removed {sweep_shared_memory()} segments of dead processes")
