@@ -131,9 +131,10 @@ def _blocks(args: argparse.Namespace) -> int:
 def _doctor(args: argparse.Namespace) -> int:
     from sf_bringup.doctor import checks
 
-    rows = checks()
-    value = [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in rows]
-    _print(value, args.json, "\n".join(f"{'ok  ' if c.ok else 'FAIL'} {c.name}: {c.detail}" for c in rows))
+    rows = checks(args.seconds)
+    value = [{"check": c.name, "ok": c.ok, "detail": c.detail, "mend": c.mend} for c in rows]
+    lines = [f"{'ok  ' if c.ok else 'FAIL'} {c.name}: {c.detail}{f'; {c.mend}' if c.mend else ''}" for c in rows]
+    _print(value, args.json, "\n".join(lines))
     return 0 if all(c.ok for c in rows) else 2
 
 
@@ -252,7 +253,8 @@ def build_parser() -> argparse.ArgumentParser:
     add_arguments(p)
 
     verb("blocks", _blocks, "list the installed blocks")
-    verb("doctor", _doctor, "check the installation and the machine")
+    p = verb("doctor", _doctor, "check the installation, the machine and the live topics")
+    p.add_argument("--seconds", type=float, default=3.0, help="listen to live topics this long (0: not at all)")
     p = verb("demo", _demo, "simulate, play, record, measure: the whole system in one command")
     p.add_argument("--out", type=Path, default=Path("demo"))
     p.add_argument("--engine", choices=("inproc", "ros"), default="ros")

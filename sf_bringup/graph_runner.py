@@ -102,7 +102,8 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
     Raises:
         SceneFactoryError: a process died, refused its configuration, or the line hangs.
     """
-    line = launches(made, given.mapping.roles, config, lossless=rate == 0, out=str(folder.path.resolve()))
+    out, compressed = str(folder.path.resolve()), given.mapping.compressed
+    line = launches(made, given.mapping.roles, config, lossless=rate == 0, out=out, compressed=compressed)
     environment = node_environment()
     logs = folder.path / "log"
     with _parent_node() as node:

@@ -27,7 +27,6 @@ from sf_interfaces.errors import ConfigError
 from sf_interfaces.io.calibration import read_camera, read_extrinsic
 from sf_interfaces.io.datasets import ReadOptions
 
-SECTIONS = {"tracking", "depth", "recon", "flexion", "sync"}
 _VERSIONED = (
     "scenefactory",
     "numpy",
@@ -141,7 +140,7 @@ def run(request: RunRequest) -> Summary:
     if any(step.sources.get(q) == "input" for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
         preflight.check_extrinsic(given)
     config = ConfigFile.load(request.config, request.overrides)
-    config.check_sections(SECTIONS)
+    config.check_sections({spec.name for spec in load_blocks()} | {"sync", "hosts"})
     folder = RunFolder(request.out)
     _write_facts(folder, request, given, source, made, config)
     started = time.monotonic()
