@@ -304,6 +304,7 @@ def test_what_is_no_data_set_is_told_what_it_is(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="seq-01"):
         recognise(tmp_path / "scene")
     (tmp_path / "scene" / "run.mcap").touch()
+    layouts.picture(tmp_path / "scene" / "plot.png", 0)
     with pytest.raises(FormatError, match=r"bags.*run\.mcap"):
         recognise(tmp_path / "scene")
 
