@@ -26,6 +26,7 @@ from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.io.calibration import read_camera, read_extrinsic
 from sf_interfaces.io.datasets import ReadOptions
+from sf_interfaces.types import Float64
 
 _VERSIONED = (
     "scenefactory",
@@ -81,11 +82,18 @@ def prepare(request: RunRequest) -> tuple[BagInput, inputs.Resolved]:
         mapping.setdefault("pose", topics.GROUND_TRUTH_PREFIX + "pose")
     found = preflight.inspect(source.bag, mapping)
     leader = found.mapping.roles.get("rgb", found.mapping.roles.get("depth", ""))
-    given = _given(request, found)
-    if given:
-        bag = inputs.with_given(source.bag, request.out, given, leader, request.reading.limit)
-        found = preflight.inspect(bag, mapping)
-    return found, source
+    camera, distortion = (None, None) if request.calibration is None else read_camera(request.calibration)
+    bag = inputs.with_given(
+        source.bag,
+        request.out,
+        image_topic=leader,
+        camera=camera,
+        distortion=distortion,
+        poses=request.poses,
+        extrinsic=_extrinsic(request, found),
+        limit=request.reading.limit,
+    )
+    return (found if bag == source.bag else preflight.inspect(bag, mapping)), source
 
 
 def _planned(request: RunRequest, given: BagInput, source: inputs.Resolved) -> Plan:
@@ -94,16 +102,14 @@ def _planned(request: RunRequest, given: BagInput, source: inputs.Resolved) -> P
     return plan(given.mapping.available, goal, load_blocks())
 
 
-def _given(request: RunRequest, found: BagInput) -> inputs.Given:
-    """What the user gave beside the input, read."""
-    camera, distortion = (None, None) if request.calibration is None else read_camera(request.calibration)
+def _extrinsic(request: RunRequest, found: BagInput) -> tuple[str, str, Float64] | None:
+    """The user's (camera frame, lidar frame, T_camera_lidar)."""
     if request.extrinsic is None:
-        return inputs.Given(camera, distortion, request.poses)
+        return None
     if "lidar" not in found.mapping.roles:
         raise ConfigError(f"--extrinsic {request.extrinsic}: the input has no LiDAR to place")
     frame = found.frames["rgb" if "rgb" in found.frames else "depth"]
-    extrinsic = (frame, found.frames["lidar"], read_extrinsic(request.extrinsic))
-    return inputs.Given(camera, distortion, request.poses, extrinsic)
+    return frame, found.frames["lidar"], read_extrinsic(request.extrinsic)
 
 
 def explain(request: RunRequest) -> tuple[dict[str, Any], str]:
