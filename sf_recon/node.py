@@ -12,7 +12,9 @@ from rclpy.task import Future
 
 from sf_interfaces import topics
 from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.io.cloud import write_surface
+from sf_interfaces.io.paths import inside
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
@@ -20,6 +22,8 @@ from sf_interfaces.ros.process import run
 from sf_interfaces.types import Camera, Keyframe, PointCloud
 from sf_recon.config import ReconConfig
 from sf_recon.core.reconstruction import Reconstruction
+
+_SNAPSHOT_KEYFRAMES = 15  # upstream keeps twice as many for a restarted node
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,13 +52,17 @@ class ReconNode(BlockNode):
     def setup(self) -> None:
         """The reconstruction and its keyframes."""
         self.leader = ""
-        self._reconstruction = Reconstruction(self.config())
+        saved = self.snapshot("recon.sfmap")
+        self._reconstruction = Reconstruction(self.config()) if saved is None else Reconstruction.load(saved)
         self._source = KeyframeSource(self, landmarks=False)
+        self._unsaved, self._resumed = 0, saved is not None
         self._camera: Camera | None = None
         self._last_ns = 0
         self.listen(topics.VIEW_POSE, "view", 1)
         for topic in (topics.SURFACE, topics.VIEW_IMAGE, topics.VIEW_DEPTH):
             self.output(topic)
+        if self._resumed:
+            self._publish_surface(self._reconstruction.surface())
 
     def take(self, kind: str, msg: Any) -> None:
         """Add keyframes; render and save between them."""
@@ -73,7 +81,7 @@ class ReconNode(BlockNode):
         """Final training, the whole surface, and the files."""
         for keyframe in self._source.end():
             self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
-        if self._camera is None:
+        if self._camera is None and not self._resumed:
             self.health.error("nothing was reconstructed: no keyframe with depth arrived")
             return
         self._reconstruction.finish()
@@ -97,6 +105,12 @@ class ReconNode(BlockNode):
         self.health.count("points", len(added))
         self._publish_surface(added)
         self.sent_one(keyframe.stamp_ns)
+        self._unsaved += 1
+        if self._unsaved >= _SNAPSHOT_KEYFRAMES and (path := self.state("recon.sfmap")) is not None:
+            with replace_file(path) as draft:
+                self._reconstruction.save(draft)
+            self._source.done(keyframe.stamp_ns)
+            self._unsaved = 0
 
     def _publish_surface(self, cloud: PointCloud) -> None:
         placed = PointCloud(cloud.points, cloud.colors, stamp_ns=self._last_ns, frame_id="map")
@@ -151,16 +165,16 @@ class ReconNode(BlockNode):
             response.image, response.depth = self._render(camera, request.pose)
 
     def _save_service(self, request: Any, response: Any) -> None:
-        if self._camera is None:
+        if self._camera is None and not self._resumed:
             response.message = "nothing is reconstructed yet; call again after the first keyframe"
             return
         try:
-            folder = Path(request.directory)
+            folder = inside(self.out, request.directory)
             folder.mkdir(parents=True, exist_ok=True)
             response.paths = [str(path) for path in self._save(folder)]
             response.success = True
         except (OSError, SceneFactoryError) as error:
-            response.message = f"cannot save to {request.directory}: {error}"
+            response.message = f"cannot save to '{request.directory}': {error}"
 
 
 def main() -> int:
