@@ -117,6 +117,18 @@ def without(bag: Path, topics: Sequence[str], suffix: str) -> Path:
     return out
 
 
+def thinned(bag: Path, frames: Sequence[int], suffix: str) -> Path:
+    """A copy of a bag that keeps only some of its frames (numbers in order of time), and what belongs to none."""
+    out = bag.with_name(f"{bag.stem}-{suffix}.mcap")
+    with BagReader(bag) as reader, SequenceWriter(out) as writer:
+        stamps = [raw.stamp_ns for raw in reader.messages([COLOUR])]
+        dropped = set(stamps) - {stamps[k] for k in frames}
+        for raw in reader.messages():
+            if raw.stamp_ns not in dropped:
+                writer.bag.write(raw.topic, raw.type, raw.stamp_ns, raw.data)
+    return out
+
+
 def run_line(bag: Path, out: Path, goal: str = "auto", **request: Any) -> RunFolder:
     """One run in this process into ``out``, as ``sf run`` does it.
 
