@@ -6,6 +6,7 @@ The ROS graph runs the same cores on the same data; on a lossless replay both gi
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.metadata import entry_points
@@ -29,6 +30,7 @@ from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import write_tum
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.sync import SyncConfig
+from sf_interfaces.timing import Timings
 from sf_interfaces.types import Float64, Frame, Keyframe, Scale, Trajectory
 
 PARTS_GROUP = "scenefactory.parts"
@@ -66,6 +68,7 @@ class ProductionLine:
         self._completer = parts.get("depth:complete")
         self.reconstruction = parts.get("recon")
         self._writer, self._config, self._epoch = writer, config, 0
+        self.timings = Timings()
         writer.posed = "tracking" in blocks or posed
         self.keyframe_poses: list[tuple[int, Float64]] = []
 
@@ -87,7 +90,8 @@ class ProductionLine:
             self._writer.flexion(frame, image)
             frame = replace(frame, image=image)
         if self.tracker is not None:
-            update = self.tracker.track(frame)
+            with self.timings.measure("tracking"):
+                update = self.tracker.track(frame)
             self._writer.tracked(frame, update)
             self._finish_keyframes(update.keyframes)
             return update.T_map_camera if update.scale is Scale.METRIC else None
@@ -116,10 +120,13 @@ class ProductionLine:
 
     def _complete(self, keyframe: Keyframe) -> None:
         if self._completer is not None:
-            keyframe = self._completer.complete(keyframe)
+            with self.timings.measure("depth"):
+                keyframe = self._completer.complete(keyframe)
             self._writer.dense(keyframe)
         if self.reconstruction is not None:
-            self._writer.surface(keyframe.stamp_ns, self.reconstruction.add(keyframe))
+            with self.timings.measure("recon"):
+                added = self.reconstruction.add(keyframe)
+            self._writer.surface(keyframe.stamp_ns, added)
 
 
 def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float) -> dict[str, int]:
@@ -169,7 +176,9 @@ def _advance(line: ProductionLine, inputs: SensorInputs) -> int:
     done = 0
     for frame in inputs.assembler.ready():
         line.in_epoch(inputs.assembler.epoch)
-        inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
+        with line.timings.measure("frame"):
+            pose = line.step(frame)
+        inputs.assembler.feed_back(frame.stamp_ns, pose)
         done += 1
     return done
 
@@ -186,7 +195,8 @@ def _head_spec(made: Plan) -> BlockSpec:
 
 
 def _save(folder: RunFolder, line: ProductionLine, writer: ResultWriter) -> None:
-    """The files that the nodes of the graph write at their end."""
+    """The files that the nodes of the graph write at their end, and where the time went."""
+    (folder.path / "timing.json").write_text(json.dumps(line.timings.to_dict()))
     if line.tracker is not None:
         trajectory = line.tracker.trajectory()
         write_tum(folder.path / "trajectory.tum", trajectory)

@@ -1,10 +1,9 @@
-"""What can be made from a finished run: rendered views, exported files, a window on the surface."""
+"""What can be made from a finished run: rendered views, a window on the surface."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
 import os
-import shutil
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ import open3d as o3d
 from sf_bringup.pipeline import load_map
 from sf_bringup.run_folder import RunFolder
 from sf_interfaces.errors import ConfigError, FormatError
-from sf_interfaces.io.trajectory import read_tum, write_kitti
+from sf_interfaces.io.trajectory import read_tum
 
 
 def _surface_file(run: RunFolder) -> Path:
@@ -44,28 +43,6 @@ def render_views(run_path: Path, poses: Path, out: Path) -> int:
         millimetres = np.nan_to_num(1000.0 * view.depth.z, nan=0.0).clip(0, 65535).astype(np.uint16)
         cv2.imwrite(str(out / f"{stamp}.depth.png"), millimetres)
     return len(views)
-
-
-def export(run_path: Path, out: Path, *, tum: bool, kitti: bool, ply: bool) -> list[Path]:
-    """Write the trajectory (TUM, KITTI) and the coloured surface (PLY) of a run into ``out``.
-
-    Raises:
-        ConfigError: no format was asked for.
-        FormatError: the run lacks what a format needs.
-    """
-    if not (tum or kitti or ply):
-        raise ConfigError("export needs at least one of --tum, --kitti, --ply")
-    run = RunFolder.open(run_path)
-    out.mkdir(parents=True, exist_ok=True)
-    written = []
-    if tum:
-        written.append(Path(shutil.copy(run.path / "trajectory.tum", out / "trajectory.tum")))
-    if kitti:
-        write_kitti(out / "trajectory.kitti", run.trajectory())
-        written.append(out / "trajectory.kitti")
-    if ply:
-        written.append(Path(shutil.copy(_surface_file(run), out / "surface.ply")))
-    return written
 
 
 def view(run_path: Path) -> None:
