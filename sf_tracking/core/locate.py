@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import jacobians, project, robust
+from sf_tracking.core.bundle import jacobians, robust
 from sf_tracking.core.keyframes import Reprojection, TrackedKeyframe, reproject
 from sf_tracking.core.update import UpdateOperator, View, search
 
@@ -48,7 +48,12 @@ class Location:
 
 
 def align_sights(
-    operator: UpdateOperator, target: View, index: int, keyframe: TrackedKeyframe, at: Reprojection, take: NDArray[np.int64]
+    operator: UpdateOperator,
+    target: View,
+    index: int,
+    keyframe: TrackedKeyframe,
+    at: Reprojection,
+    take: NDArray[np.int64],
 ) -> Sights:
     """Sights of the patches ``take`` of one keyframe, corrected from their reprojections."""
     update = operator(keyframe.described.take(take), target, at.uv[take], at.warp[take])
@@ -117,9 +122,7 @@ class Locator:
         T_cw = self._search(window, view, predicted, wide)
         return None if T_cw is None else self.align(window, view, T_cw)
 
-    def _search(
-        self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, wide: bool
-    ) -> Float64 | None:
+    def _search(self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, wide: bool) -> Float64 | None:
         """A first pose from the newest keyframes' patches, found over the levels of the pyramid."""
         parts, tried = [], 0
         for index in range(len(window) - 1, max(-1, len(window) - (4 if wide else 2)), -1):
@@ -139,7 +142,9 @@ class Locator:
         enough = agreeing >= self._config.min_inliers and agreeing > _AGREEING * len(sights)
         return T_cw if enough else None
 
-    def align(self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, every: bool = False) -> Location | None:
+    def align(
+        self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, every: bool = False
+    ) -> Location | None:
         """Pose from aligned patches of all keyframes, from a start T_cw within about a pixel.
 
         ``every`` aligns all visible patches, else at most ``config.edges``.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sf_interfaces.types import Camera, Float32, Float64, Frame, SparseDepth, UInt8
+from sf_interfaces.types import Camera, Float64, Frame, UInt8
 from sf_tracking.config import TrackingConfig
 
 _PLANE_HALF = 4  # px, half side of the window of dense depth to which a plane is fitted
@@ -138,13 +138,12 @@ def measure(frame: Frame, uv: Float64, config: TrackingConfig) -> Measured:
     w0, slope, rough = _fit_planes(offset, w, known.astype(np.float64))
     z = 1.0 / np.maximum(w0, 1e-3)
     # Structured light errs with z^2, that is alike in inverse depth; LiDAR alike in depth.
-    if frame.sparse_depth is None:
-        model = np.full(count, config.depth_sigma)
-    else:
-        model = config.lidar_sigma / z**2
+    dense = frame.sparse_depth is None
+    model = np.full(count, config.depth_sigma) if dense else config.lidar_sigma / z**2
     spread = np.where(known, np.abs(w - w0[:, None] - np.einsum("ckj,cj->ck", offset, slope)), 0.0).max(axis=1)
     broken = spread > np.maximum(config.depth_gap * w0, 6 * model)
-    broken |= np.abs(slope).max(axis=1) > _GRAZING * w0 if frame.sparse_depth is None else False
+    if dense:
+        broken |= np.abs(slope).max(axis=1) > _GRAZING * w0
     enough = (known.mean(axis=1) >= _KNOWN_SHARE) & (w0 > 1.0 / config.max_depth)
     # A smooth sensor earns trust, but never beyond a part of its model: offsets do not show in the residual.
     sigma = np.hypot(0.25 * model, rough)

@@ -98,7 +98,9 @@ class Window:
         problem = self._problem()
         free = np.arange(len(keyframes)) >= min(fixed, len(keyframes) - 1)
         c = self._config
-        solved, information = adjust(keyframes[0].camera, problem, free, c.robust_sigmas, iterations or c.bundle_iterations)
+        solved, information = adjust(
+            keyframes[0].camera, problem, free, c.robust_sigmas, iterations or c.bundle_iterations
+        )
         known = np.concatenate([k.patches.w for k in keyframes])
         low, high = np.median(known) * _RANGE[0], np.median(known) * _RANGE[1]
         for i, keyframe in enumerate(keyframes):
