@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sf_interfaces.types import Float32, Float64
 
 _STOP_PX = 0.01
+_WORTHWHILE = 0.7
 _RIDGE = 1e-3  # (grey level / px)^2 per pixel; keeps the normal matrix of a flat patch invertible
 _GREY = 128.0  # subtracted from grey levels: sums of squares stay small in float32
 
@@ -61,7 +62,7 @@ def offsets(side: int) -> Float64:
 
 def sample(image: Float32, pixels: Float64) -> Float32:
     """Bilinear samples [E, P] at continuous pixels [E, P, 2]; the border repeats outside."""
-    at = (pixels - 0.5).astype(np.float32)
+    at = pixels.astype(np.float32) - np.float32(0.5)
     u, v = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
     return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
@@ -82,26 +83,27 @@ def describe(image: Float32, uv: Float64, side: int) -> Templates:
 def align(image: Float32, templates: Templates, start: Float64, warp: Float64, iterations: int) -> Alignment:
     """Find templates in ``image`` [H, W] near ``start`` [E, 2] px, warped by ``warp`` [E, 2, 2]."""
     count, pixels = len(templates), templates.J.shape[2]
-    spread = offsets(round(np.sqrt(pixels))) @ warp.transpose(0, 2, 1)  # [E, P, 2] px, about the centre
+    spread = offsets(round(np.sqrt(pixels))).astype(np.float32) @ warp.transpose(0, 2, 1).astype(np.float32)
     centre = np.array(start)
     solution, residual, explained = np.zeros((count, 4)), np.zeros(count), np.zeros(count)
-    active = np.arange(count)
+    active, J, inverse = np.arange(count), templates.J, templates.inverse
     for _ in range(iterations):
-        J, inverse = templates.J[active], templates.inverse[active]
-        values = sample(image, centre[active, None] + spread[active]) - np.float32(_GREY)
+        values = sample(image, centre[active, None].astype(np.float32) + spread) - np.float32(_GREY)
         moment = (J @ values[..., None])[..., 0].astype(np.float64)
         x = (inverse @ moment[..., None])[..., 0]
-        energy = np.einsum("ep,ep->e", values, values).astype(np.float64)
-        left = np.maximum(energy - np.einsum("ei,ei->e", moment, x), 0.0)
+        energy = (values[:, None] @ values[..., None])[:, 0, 0].astype(np.float64)
+        left = np.maximum(energy - (moment * x).sum(axis=1), 0.0)
         variance = np.maximum(energy - moment[:, 3] ** 2 / pixels, 1e-9)
         solution[active], residual[active], explained[active] = x, left, 1.0 - left / variance
         gain = np.where(np.abs(x[:, 2]) > 0.05, x[:, 2], np.inf)
         shift = np.clip(x[:, :2] / gain[:, None], -2.0, 2.0)
         step = (warp[active] @ shift[..., None])[..., 0]
         centre[active] -= step
-        active = active[np.abs(step).max(axis=1) > _STOP_PX]
-        if len(active) == 0:
+        moving = np.abs(step).max(axis=1) > _STOP_PX
+        if not moving.any():
             break
+        if moving.mean() < _WORTHWHILE:  # copying what still moves is cheaper than going on with all
+            active, J, inverse, spread = active[moving], J[moving], inverse[moving], spread[moving]
     noise = residual / (pixels - 4)
     gain = solution[:, 2]
     spread_px = noise / np.maximum(gain**2, 1e-4)

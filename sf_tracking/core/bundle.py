@@ -32,7 +32,7 @@ class Problem:
     prior: Float64  # [N, M] measured or expected inverse depth
     prior_weight: Float64  # [N, M] 1 / variance of the prior; 0: the inverse depth is free
     uv: Float64  # [N, N, M, 2] px, patch of the first index seen in the second
-    information: Float64  # [N, N, M, 2, 2] 1/px^2; 0: not seen
+    root: Float64  # [N, N, M, 3] root of the information (information_root); 0: not seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,26 +47,53 @@ class _Linear:
 
 
 def project(camera: Camera, T_ts: Float64, rays: Float64, w: Float64) -> tuple[Float64, Float64]:
-    """Continuous px [..., 2] and scaled points [..., 3] of rays [..., 2] moved by T_ts [..., 4, 4]."""
-    X = np.einsum("...ij,...j->...i", T_ts[..., :3, :2], rays) + T_ts[..., :3, 2] + w[..., None] * T_ts[..., :3, 3]
+    """Continuous px [..., M, 2] and scaled points [..., M, 3] of rays [..., M, 2] moved by T_ts [..., 4, 4]."""
+    R = np.swapaxes(T_ts[..., :3, :3], -1, -2)
+    X = rays @ R[..., :2, :] + R[..., 2:, :] + w[..., None] * T_ts[..., None, :3, 3]
     z = np.where(X[..., 2] > _MIN_Z, X[..., 2], np.nan)
     uv = X[..., :2] / z[..., None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return uv, X
 
 
-def jacobians(camera: Camera, X: Float64, w: Float64, t: Float64) -> tuple[Float64, Float64]:
-    """d(uv)/d(xi) [..., 2, 6] for exp(xi) T_cw of the target, and d(uv)/dw [..., 2], at scaled points X."""
+def jacobians(camera: Camera, X: Float64, w: Float64, t: Float64, root: Float64) -> tuple[Float64, Float64]:
+    """Whitened derivatives of the projection at scaled points X [..., M, 3] with inverse depth w [..., M].
+
+    Args:
+        t: [..., 3] translation of the motion that brought the points here, m.
+        root: [..., M, 3] (a, b, c) of ``[[a, b], [0, c]]``, a root of the information: r -> (a r_u + b r_v, c r_v).
+
+    Returns:
+        d(whitened uv)/d(xi) [..., 6, 2, M] for exp(xi) T_cw, and d(whitened uv)/dw [..., 2, M].
+    """
     iz = 1.0 / X[..., 2]
     x, y, d = X[..., 0] * iz, X[..., 1] * iz, w * iz
-    J = np.zeros((*X.shape[:-1], 2, 6))
-    J[..., 0, 0], J[..., 0, 2], J[..., 0, 3] = d, -x * d, -x * y
-    J[..., 0, 4], J[..., 0, 5] = 1 + x * x, -y
-    J[..., 1, 1], J[..., 1, 2], J[..., 1, 3] = d, -y * d, -1 - y * y
-    J[..., 1, 4], J[..., 1, 5] = x * y, x
-    J[..., 0, :] *= camera.fx
-    J[..., 1, :] *= camera.fy
-    J_w = np.stack([camera.fx * (t[..., 0] - t[..., 2] * x) * iz, camera.fy * (t[..., 1] - t[..., 2] * y) * iz], -1)
+    along_u = (t[..., 0, None] - t[..., 2, None] * x) * iz
+    along_v = (t[..., 1, None] - t[..., 2, None] * y) * iz
+    J = np.empty((*w.shape[:-1], 6, 2, w.shape[-1]))
+    J_w = np.empty((*w.shape[:-1], 2, w.shape[-1]))
+    rows = ((camera.fx * root[..., 0], camera.fy * root[..., 1]), (np.zeros_like(w), camera.fy * root[..., 2]))
+    for row, (a, b) in enumerate(rows):
+        J[..., 0, row, :], J[..., 1, row, :] = a * d, b * d
+        J[..., 2, row, :] = -d * (a * x + b * y)
+        J[..., 3, row, :] = -a * x * y - b * (1 + y * y)
+        J[..., 4, row, :] = a * (1 + x * x) + b * x * y
+        J[..., 5, row, :] = b * x - a * y
+        J_w[..., row, :] = a * along_u + b * along_v
     return J, J_w
+
+
+def information_root(information: Float64) -> Float64:
+    """(a, b, c) [..., 3] with ``[[a, b], [0, c]]`` a root of the information [..., 2, 2]; 0 where it is 0."""
+    a = np.sqrt(information[..., 0, 0])
+    b = np.divide(information[..., 0, 1], a, out=np.zeros_like(a), where=a > 0)
+    c = np.sqrt(np.maximum(information[..., 1, 1] - b * b, 0.0))
+    return np.stack([a, b, c], axis=-1)
+
+
+def whiten(r: Float64, root: Float64) -> Float64:
+    """Residuals [..., M, 2] px in standard deviations, [..., 2, M]."""
+    u = root[..., 0] * r[..., 0] + root[..., 1] * r[..., 1]
+    return np.stack([u, root[..., 2] * r[..., 1]], axis=-2)
 
 
 def robust(squared: Float64, scale: float) -> tuple[Float64, Float64]:
@@ -76,36 +103,31 @@ def robust(squared: Float64, scale: float) -> tuple[Float64, Float64]:
 
 
 def _residuals(camera: Camera, p: Problem) -> tuple[Float64, Float64, Float64]:
-    """r [N, N, M, 2] (0 where nothing is seen), scaled points [N, N, M, 3] and T_ts [N, N, 4, 4]."""
+    """Whitened r [N, N, 2, M] (0 where nothing is seen), scaled points [N, N, M, 3] and T_ts [N, N, 4, 4]."""
     T_ts = p.T_cw[None] @ se3.inverse(p.T_cw)[:, None]
-    uv, X = project(camera, T_ts[:, :, None], p.rays[:, None], p.w[:, None])
-    r = np.where(np.isfinite(uv), p.uv - uv, 0.0)
-    X = np.where((X[..., 2] > _MIN_Z)[..., None], X, (0.0, 0.0, 1.0))
-    return r, X, T_ts
-
-
-def _squared(r: Float64, information: Float64) -> Float64:
-    a, b = r[..., 0], r[..., 1]
-    return a * a * information[..., 0, 0] + 2 * a * b * information[..., 0, 1] + b * b * information[..., 1, 1]
+    uv, X = project(camera, T_ts, p.rays[:, None], p.w[:, None])
+    valid = (X[..., 2] > _MIN_Z)[..., None]
+    return whiten(np.where(valid, p.uv - uv, 0.0), p.root), np.where(valid, X, (0.0, 0.0, 1.0)), T_ts
 
 
 def cost(camera: Camera, p: Problem, scale: float) -> float:
     """Robust cost of all observations and priors."""
-    r = _residuals(camera, p)[0]
+    squared = (_residuals(camera, p)[0] ** 2).sum(axis=2)
     depth = p.prior_weight * (p.prior - p.w) ** 2
-    return float(robust(_squared(r, p.information), scale)[1].sum() + robust(depth, scale)[1].sum())
+    return float(robust(squared, scale)[1].sum() + robust(depth, scale)[1].sum())
 
 
 def _linearise(camera: Camera, p: Problem, scale: float) -> _Linear:
     n, m = p.w.shape
     r, X, T_ts = _residuals(camera, p)
-    W = p.information * robust(_squared(r, p.information), scale)[0][..., None, None]
-    J, J_w = jacobians(camera, X, np.broadcast_to(p.w[:, None], X.shape[:-1]), T_ts[:, :, None, :3, 3])
-    WJ = (W @ J).reshape(n, n, 2 * m, 6)
-    own = WJ.transpose(0, 1, 3, 2) @ J.reshape(n, n, 2 * m, 6)  # [N, N, 6, 6] of the target's pose, for each pair
-    g = (WJ.transpose(0, 1, 3, 2) @ r.reshape(n, n, 2 * m, 1))[..., 0]  # [N, N, 6]
-    WJ_w = (W @ J_w[..., None])[..., 0]
-    couple = np.einsum("stmki,stmk->stim", J, WJ_w)  # [N, N, 6, M]
+    weight = np.sqrt(robust((r**2).sum(axis=2), scale)[0])  # [N, N, M]
+    w = np.broadcast_to(p.w[:, None], weight.shape)
+    J, J_w = jacobians(camera, X, w, T_ts[..., :3, 3], p.root * weight[..., None])
+    r = r * weight[:, :, None]
+    couple = (J * J_w[:, :, None]).sum(axis=3)  # [N, N, 6, M]
+    J = J.reshape(n, n, 6, 2 * m)
+    own = J @ J.transpose(0, 1, 3, 2)  # [N, N, 6, 6] of the target's pose, for each pair
+    g = (J @ r.reshape(n, n, 2 * m, 1))[..., 0]  # [N, N, 6]
     # The source's Jacobian is that of the target times -Ad(T_ts): its blocks follow from the pair's own.
     A = -se3.adjoint(T_ts)
     At = A.transpose(0, 1, 3, 2)
@@ -118,8 +140,8 @@ def _linearise(camera: Camera, p: Problem, scale: float) -> _Linear:
     E = couple.copy()
     E[diagonal, diagonal] += (At @ couple).sum(axis=1)
     on_prior = p.prior_weight * robust(p.prior_weight * (p.prior - p.w) ** 2, scale)[0]
-    C = np.einsum("stmk,stmk->sm", J_w, WJ_w) + on_prior
-    c = np.einsum("stmk,stmk->sm", WJ_w, r) + on_prior * (p.prior - p.w)
+    C = (J_w**2).sum(axis=(1, 2)) + on_prior
+    c = (J_w * r).sum(axis=(1, 2)) + on_prior * (p.prior - p.w)
     return _Linear(H.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n), b.reshape(-1), C, c, E)
 
 

@@ -117,7 +117,7 @@ class Initialiser:
         rays, w = first.patches.rays(first.camera)[alive], first.patches.w[alive]
         X = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
         information = np.broadcast_to(np.eye(2) / _SIGMA_PX**2, (len(rays), 2, 2))
-        return solve_pose(first.camera, np.eye(4), X, w, uv[alive], information, scale=3.0)[0]
+        return solve_pose(first.camera, np.eye(4), X, w, uv[alive], information, (30.0, 3.0))[0]
 
 
 def _set_depth(keyframe: TrackedKeyframe, w: Float64) -> None:

@@ -69,16 +69,17 @@ def reproject(keyframe: TrackedKeyframe, T_cw: Float64) -> Reprojection:
     T = T_cw @ se3.inverse(keyframe.T_cw)
     uv, X = project(camera, T, patches.rays(camera), patches.w)
     z = np.where(np.isfinite(uv[:, 0]), X[:, 2], 1.0)
-    J = np.zeros((len(uv), 2, 3))
-    J[:, 0, 0], J[:, 0, 2] = camera.fx / z, -camera.fx * X[:, 0] / z**2
-    J[:, 1, 1], J[:, 1, 2] = camera.fy / z, -camera.fy * X[:, 1] / z**2
-    along = T[:3, :2] / (camera.fx, camera.fy) + T[:3, 3][:, None] * patches.slope[:, None, :]  # [M, 3, 2] dX/d(uv)
-    warp = J @ along
-    area = np.linalg.det(warp)
+    focal = np.array([camera.fx, camera.fy])
+    along = T[:3, :2] / focal + T[:3, 3][:, None] * patches.slope[:, None, :]  # [M, 3, 2] dX/d(uv)
+    scaled = focal / z[:, None]  # [M, 2]
+    on_axis = X[:, :2] / z[:, None]  # [M, 2]
+    warp = scaled[..., None] * (along[:, :2] - on_axis[..., None] * along[:, 2:])
+    J_w = scaled * (T[:2, 3] - on_axis * T[2, 3])
+    area = warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0]
     with np.errstate(invalid="ignore"):
         visible = (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
     visible &= (area > _SHEAR[0]) & (area < _SHEAR[1])
-    return Reprojection(uv, warp, J @ T[:3, 3], patches.w / z, visible)
+    return Reprojection(uv, warp, J_w, patches.w / z, visible)
 
 
 def wants_keyframe(config: TrackingConfig, keyframe: TrackedKeyframe, flow_px: Float64, share: float) -> bool:

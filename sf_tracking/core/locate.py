@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import jacobians, robust
+from sf_tracking.core.bundle import information_root, jacobians, robust, whiten
 from sf_tracking.core.keyframes import Reprojection, TrackedKeyframe, reproject
 from sf_tracking.core.update import UpdateOperator, View, search
 
@@ -20,7 +20,10 @@ _SEARCH_SIGMA = 0.5  # px, of a position found by the search over levels
 _SEARCHED = 200  # patches searched over levels to find the motion
 _WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must not be rejected far from the truth
 _AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
-_STILL = 1e-7  # step of the pose that ends the iterations
+_CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
+_STILL = 1e-6  # step of the pose, m and rad, that ends the iterations
+_STEPS = 6  # at most, per robust scale
+_BEHIND = 1e-3  # of the unit ray, up to which a point counts as behind the camera
 _PRIOR = np.diag([1e2] * 3 + [1e3] * 3)  # information that the prediction adds where patches see nothing
 
 
@@ -44,6 +47,7 @@ class Location:
     T_cw: Float64
     sights: Sights
     inliers: int
+    found: float  # share of the patches looked for that were found
     overlap: float  # share of the newest keyframe's patches that are in view and were found
 
 
@@ -69,43 +73,41 @@ def join(parts: Sequence[Sights]) -> Sights:
 
 
 def solve_pose(
-    camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64, information: Float64, scale: float
+    camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64, information: Float64, scales: Sequence[float]
 ) -> tuple[Float64, Float64]:
     """Robust pose of a camera from patches in the world, near ``T_cw``; Gauss-Newton.
 
     Args:
         X: [E, 3] scaled points, world position times inverse depth ``w`` [E].
         uv, information: [E, 2] px and [E, 2, 2] where they were seen.
-        scale: where the robust kernel sets in, standard deviations.
+        scales: where the robust kernel sets in, standard deviations; narrower from one to the next.
 
     Returns:
         The pose and the reprojection errors [E] px there.
     """
-    predicted = T_cw
-    for _ in range(12):
-        r, Xc, valid = _reprojection_error(camera, T_cw, X, w, uv)
-        squared = np.einsum("ei,eij,ej->e", r, information, r)
-        W = information * np.where(valid, robust(squared, scale)[0], 0.0)[:, None, None]
-        J, _ = jacobians(camera, Xc, w, np.zeros((len(w), 3)))
-        JW = J.transpose(0, 2, 1) @ W
-        away = se3.log(predicted @ se3.inverse(T_cw))
-        H = np.einsum("eik,ekj->ij", JW, J) + _PRIOR
-        step = np.linalg.solve(H, np.einsum("eik,ek->i", JW, r) + _PRIOR @ away)
-        T_cw = se3.exp(step) @ T_cw
-        if np.abs(step).max() < _STILL:
-            break
-    r, _, valid = _reprojection_error(camera, T_cw, X, w, uv)
-    return se3.orthonormalise(T_cw), np.where(valid, np.linalg.norm(r, axis=1), np.inf)
+    root, away = information_root(information), np.zeros(6)
+    for scale in scales:
+        for _ in range(_STEPS):
+            r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
+            white = whiten(r, root)  # [2, E]
+            weight = np.sqrt(robust((white**2).sum(axis=0), scale)[0])
+            J, _ = jacobians(camera, Xc, w, np.zeros(3), root * weight[:, None])
+            J = J.reshape(6, -1)
+            step = np.linalg.solve(J @ J.T + _PRIOR, J @ (white * weight).ravel() - _PRIOR @ away)
+            T_cw, away = se3.exp(step) @ T_cw, away + step
+            if np.abs(step).max() < _STILL:
+                break
+    r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
+    return se3.orthonormalise(T_cw), np.where(Xc[:, 2] > _BEHIND, np.linalg.norm(r, axis=1), np.inf)
 
 
-def _reprojection_error(
-    camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64
-) -> tuple[Float64, Float64, NDArray[np.bool_]]:
+def _reprojection_error(camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64) -> tuple[Float64, Float64]:
+    """Residual [E, 2] px, 0 for patches behind the camera, and their scaled points [E, 3]."""
     Xc = X @ T_cw[:3, :3].T + w[:, None] * T_cw[:3, 3]
-    valid = Xc[:, 2] > 1e-3
-    Xc = np.where(valid[:, None], Xc, (0.0, 0.0, 1.0))
+    behind = Xc[:, 2:] <= _BEHIND
+    Xc = np.where(behind, (0.0, 0.0, _BEHIND), Xc)
     projected = Xc[:, :2] / Xc[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    return np.where(valid[:, None], uv - projected, 0.0), Xc, valid
+    return np.where(behind, 0.0, uv - projected), Xc
 
 
 class Locator:
@@ -118,7 +120,14 @@ class Locator:
     def __call__(
         self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, *, wide: bool
     ) -> Location | None:
-        """Pose near ``predicted`` T_cw, or None when too few patches agree on one."""
+        """Pose near ``predicted`` T_cw, or None when too few patches agree on one.
+
+        A smooth motion is predicted well enough to align at once; else the search over levels comes first.
+        """
+        if not wide:
+            found = self.align(window, view, predicted)
+            if found is not None and found.found > _CERTAIN[0] and found.inliers > _CERTAIN[1] * len(found.sights):
+                return found
         T_cw = self._search(window, view, predicted, wide)
         return None if T_cw is None else self.align(window, view, T_cw)
 
@@ -166,8 +175,9 @@ class Locator:
         if inliers < self._config.min_inliers or inliers < 0.3 * len(sights):
             return None
         newest = len(window) - 1
-        found = float((sights.keyframe == newest).sum()) / max(1, int((owner == newest).sum()))
-        return Location(T_cw, sights, inliers, found * float(ats[-1].visible.mean()))
+        share = float((sights.keyframe == newest).sum()) / max(1, int((owner == newest).sum()))
+        overlap = share * float(ats[-1].visible.mean())
+        return Location(T_cw, sights, inliers, len(sights) / max(1, len(owner)), overlap)
 
     def _pose(
         self, window: Sequence[TrackedKeyframe], sights: Sights, T_cw: Float64, scales: Sequence[float]
@@ -186,11 +196,7 @@ class Locator:
             X[mine] = rays @ T_wc[:3, :2].T + T_wc[:3, 2] + w[mine, None] * T_wc[:3, 3]
             J_w = reproject(keyframe, T_cw).J_w[take] * keyframe.patches.sigma[take, None]
             covariance[mine] += J_w[:, :, None] * J_w[:, None, :]
-        information = np.linalg.inv(covariance)
-        error = np.zeros(len(sights))
-        for scale in scales:
-            T_cw, error = solve_pose(window[-1].camera, T_cw, X, w, sights.uv, information, scale)
-        return T_cw, error
+        return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, np.linalg.inv(covariance), scales)
 
 
 def _thin(index: NDArray[np.int64], count: int) -> NDArray[np.int64]:

@@ -79,18 +79,20 @@ def _candidates(frame: Frame, gray: UInt8, config: TrackingConfig) -> tuple[Floa
     """Places [C, 2] px worth a patch and their corner quality [C]: corners, or LiDAR points on texture."""
     camera = frame.camera
     assert camera is not None
-    corner = cv2.cornerMinEigenVal(gray, config.patch_px, ksize=3)
+    # Half the resolution shows the same corners at a quarter of the cost.
+    corner = cv2.cornerMinEigenVal(cv2.pyrDown(gray), config.patch_px // 2, ksize=3)
     border = config.patch_px // 2 + 2
     if frame.sparse_depth is not None:
         uv = frame.sparse_depth.uv
         inside = (uv >= border).all(axis=1) & (uv < (camera.width - border, camera.height - border)).all(axis=1)
         uv = uv[inside & (frame.sparse_depth.z[: len(inside)] < config.max_depth)]
-        col, row = np.floor(uv).astype(np.int64).T
+        col, row = np.floor(uv / 2).astype(np.int64).T
     else:
-        peak = corner >= cv2.dilate(corner, np.ones((5, 5), np.uint8))
-        peak[:border], peak[-border:], peak[:, :border], peak[:, -border:] = False, False, False, False
+        peak = corner >= cv2.dilate(corner, np.ones((3, 3), np.uint8))
+        edge = border // 2 + 1
+        peak[:edge], peak[-edge:], peak[:, :edge], peak[:, -edge:] = False, False, False, False
         row, col = np.nonzero(peak)
-        uv = np.stack([col + 0.5, row + 0.5], axis=-1)
+        uv = np.stack([2 * col + 0.5, 2 * row + 0.5], axis=-1)
     score = corner[row, col].astype(np.float64)
     good = score > config.min_quality * float(corner.max())
     return uv[good], score[good]

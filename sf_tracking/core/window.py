@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from sf_interfaces.types import Camera, Float64, Frame
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import Problem, adjust
+from sf_tracking.core.bundle import Problem, adjust, information_root
 from sf_tracking.core.keyframes import TrackedKeyframe, reproject
 from sf_tracking.core.locate import Sights, align_sights
 from sf_tracking.core.patches import Measured, Patches, extract
@@ -123,7 +123,7 @@ class Window:
             for stamp, (where, how_sure) in keyframe.seen.items():
                 if stamp in index:
                     uv[i, index[stamp], :k], information[i, index[stamp], :k] = where, how_sure
-        return Problem(np.stack([k.T_cw for k in keyframes]), rays, w, prior, weight, uv, information)
+        return Problem(np.stack([k.T_cw for k in keyframes]), rays, w, prior, weight, uv, information_root(information))
 
     def rescale(self, unit: float) -> None:
         """Multiply all lengths by ``unit``, 1/m."""

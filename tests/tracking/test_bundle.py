@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.align import align
 from sf_interfaces.types import Camera
-from sf_tracking.core.bundle import Problem, adjust, cost, jacobians, project
+from sf_tracking.core.bundle import Problem, adjust, cost, information_root, jacobians, project, whiten
 
 CAMERA = Camera(640, 480, 500.0, 480.0, 320.0, 240.0)
 
@@ -26,12 +26,12 @@ def scene(seed: int, n: int = 4, m: int = 25, noise: float = 0.0, outliers: int 
     uv0, w = rng.uniform((0, 0), (640, 480), (n, m, 2)), 1 / rng.uniform(2, 8, (n, m))
     rays = (uv0 - (CAMERA.cx, CAMERA.cy)) / (CAMERA.fx, CAMERA.fy)
     T_ts = T[None] @ se3.inverse(T)[:, None]
-    uv, _ = project(CAMERA, T_ts[:, :, None], rays[:, None], w[:, None])
+    uv, _ = project(CAMERA, T_ts, rays[:, None], w[:, None])
     uv = uv + rng.normal(0, noise, uv.shape)
     uv[:, :, :outliers] += 40.0
     information = np.broadcast_to(np.array([[1.0, 0.2], [0.2, 0.7]]), (n, n, m, 2, 2)).copy()
     information[np.arange(n), np.arange(n)] = 0.0
-    truth = Problem(T, rays, w, w, np.zeros((n, m)), uv, information)
+    truth = Problem(T, rays, w, w, np.zeros((n, m)), uv, information_root(information))
     start = se3.exp(rng.normal(0, 0.02, (n, 6))) @ T
     start[0] = T[0]
     return truth, replace(truth, T_cw=start, w=w * rng.uniform(0.8, 1.25, w.shape))
@@ -44,14 +44,21 @@ def test_jacobians_equal_differences(seed: int) -> None:
     rays, w = rng.uniform(-0.6, 0.6, (1, 2)), rng.uniform(0.1, 1.0, 1)
     T = se3.exp(rng.normal(0, 0.1, 6))
     _, X = project(CAMERA, T, rays, w)
-    J, J_w = jacobians(CAMERA, X, w, T[None, :3, 3])
+    information = np.array([[[2.0, 0.6], [0.6, 1.5]]])
+    root = information_root(information)
+    np.testing.assert_allclose((whiten(np.array([[0.3, -0.7]]), root) ** 2).sum(), 0.663, rtol=1e-9)
+    J, J_w = jacobians(CAMERA, X, w, T[:3, 3], root)
     step = 1e-6
+
+    def difference(ahead: np.ndarray, behind: np.ndarray) -> np.ndarray:
+        return whiten((ahead - behind) / (2 * step), root)
+
     for k in range(6):
         xi = np.eye(6)[k] * step
         ahead, behind = (project(CAMERA, se3.exp(s * xi) @ T, rays, w)[0] for s in (1, -1))
-        np.testing.assert_allclose(J[0, :, k], (ahead - behind)[0] / (2 * step), rtol=1e-4, atol=1e-3)
+        np.testing.assert_allclose(J[k], difference(ahead, behind), rtol=1e-4, atol=1e-3)
     ahead, behind = (project(CAMERA, T, rays, w + s * step)[0] for s in (1, -1))
-    np.testing.assert_allclose(J_w[0], (ahead - behind)[0] / (2 * step), rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(J_w, difference(ahead, behind), rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -94,8 +101,8 @@ def test_schur_complement_reaches_the_optimum_of_a_dense_solver() -> None:
     def errors(x: np.ndarray) -> np.ndarray:
         p = rebuild(x)
         T_ts = p.T_cw[None] @ se3.inverse(p.T_cw)[:, None]
-        r = p.uv - project(CAMERA, T_ts[:, :, None], p.rays[:, None], p.w[:, None])[0]
-        squared = np.einsum("stmi,stmij,stmj->stm", r, p.information, r)
+        r = p.uv - project(CAMERA, T_ts, p.rays[:, None], p.w[:, None])[0]
+        squared = (whiten(r, p.root) ** 2).sum(axis=2)
         both = np.r_[squared.ravel(), (p.prior_weight * (p.prior - p.w) ** 2).ravel()]
         return 3.0 * np.sqrt(np.log1p(both / 9.0))
 
@@ -114,7 +121,7 @@ def test_outliers_lose_their_weight() -> None:
 
 def test_a_patch_never_seen_stays_where_it_is() -> None:
     _, start = scene(2)
-    start.information[0, :, 3] = 0.0
+    start.root[0, :, 3] = 0.0
     found, _ = adjust(CAMERA, start, np.arange(4) >= 1, 3.0, 10)
     assert found.w[0, 3] == pytest.approx(start.w[0, 3])
 
