@@ -34,6 +34,8 @@ class TrackingConfig:
     parallax: float = option(0.01, "flow without rotation that starts a map without depth, per width", low=0.001)
     depth_gap: float = option(0.05, "relative depth step near a patch above which it is rejected", low=0.0)
     depth_sigma: float = option(0.004, "noise of dense inverse depth, 1/m (depth errs with z^2)", low=1e-6)
+    shape_trust: float = option(1.0, "share of depth points that count when surfaces are aligned", low=0.0, high=1.0)
+    shape_keyframes: int = option(3, "keyframes to whose surface that of a new keyframe is aligned", low=0, high=20)
     lidar_sigma: float = option(0.03, "noise of LiDAR depth, m", low=1e-4)
     min_quality: float = option(0.002, "corner quality of a patch relative to the image's best", low=0.0, high=1.0)
     max_depth: float = option(80.0, "measured depths beyond are not used, m", low=0.1)

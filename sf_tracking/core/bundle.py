@@ -33,6 +33,8 @@ class Problem:
     prior_weight: Float64  # [N, M] 1 / variance of the prior; 0: the inverse depth is free
     uv: Float64  # [N, N, M, 2] px, patch of the first index seen in the second
     root: Float64  # [N, N, M, 3] root of the information (information_root); 0: not seen
+    motion: Float64  # [N, N, 4, 4] measured T_second_first
+    motion_information: Float64  # [N, N, 6, 6] of exp(xi) motion; 0: not measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +116,17 @@ def cost(camera: Camera, p: Problem, scale: float) -> float:
     """Robust cost of all observations and priors."""
     squared = (_residuals(camera, p)[0] ** 2).sum(axis=2)
     depth = p.prior_weight * (p.prior - p.w) ** 2
-    return float(robust(squared, scale)[1].sum() + robust(depth, scale)[1].sum())
+    moved = np.einsum("sti,stij,stj->", *_motion_error(p, p.T_cw[None] @ se3.inverse(p.T_cw)[:, None]))
+    return float(robust(squared, scale)[1].sum() + robust(depth, scale)[1].sum() + moved)
+
+
+def _motion_error(p: Problem, T_ts: Float64) -> tuple[Float64, Float64, Float64]:
+    """log(T_ts motion^-1) [N, N, 6] where a motion was measured, its information, and the error again."""
+    e = np.zeros((*T_ts.shape[:2], 6))
+    known = p.motion_information.any(axis=(2, 3))
+    if known.any():
+        e[known] = se3.log(T_ts[known] @ se3.inverse(p.motion[known]))
+    return e, p.motion_information, e
 
 
 def _linearise(camera: Camera, p: Problem, scale: float) -> _Linear:
@@ -128,6 +140,9 @@ def _linearise(camera: Camera, p: Problem, scale: float) -> _Linear:
     J = J.reshape(n, n, 6, 2 * m)
     own = J @ J.transpose(0, 1, 3, 2)  # [N, N, 6, 6] of the target's pose, for each pair
     g = (J @ r.reshape(n, n, 2 * m, 1))[..., 0]  # [N, N, 6]
+    e, motion_information, _ = _motion_error(p, T_ts)
+    own += motion_information
+    g -= (motion_information @ e[..., None])[..., 0]
     # The source's Jacobian is that of the target times -Ad(T_ts): its blocks follow from the pair's own.
     A = -se3.adjoint(T_ts)
     At = A.transpose(0, 1, 3, 2)

@@ -105,7 +105,7 @@ class Initialiser:
         if found is None or second is None:
             window.keyframes.clear()
             return []
-        window.add(second, found.sights)
+        window.add(second, found)
         window.optimise(fixed=1, iterations=_ITERATIONS)
         window.rescale(float(np.median(first.patches.w)))
         self._reference = None
@@ -117,7 +117,7 @@ class Initialiser:
         rays, w = first.patches.rays(first.camera)[alive], first.patches.w[alive]
         X = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
         information = np.broadcast_to(np.eye(2) / _SIGMA_PX**2, (len(rays), 2, 2))
-        return solve_pose(first.camera, np.eye(4), X, w, uv[alive], information, (30.0, 3.0))[0]
+        return solve_pose(first.camera, np.eye(4), X, w, uv[alive], information, (30.0, 3.0)).T_cw
 
 
 def _set_depth(keyframe: TrackedKeyframe, w: Float64) -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ _WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must n
 _AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
 _CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
 _STILL = 1e-6  # step of the pose, m and rad, that ends the iterations
+_MEDIAN_CHI2 = 1.386  # of two degrees of freedom
 _STEPS = 6  # at most, per robust scale
 _BEHIND = 1e-3  # of the unit ray, up to which a point counts as behind the camera
 _PRIOR = np.diag([1e2] * 3 + [1e3] * 3)  # information that the prediction adds where patches see nothing
@@ -45,6 +46,8 @@ class Location:
     """The pose of an image and the sights that it rests on."""
 
     T_cw: Float64
+    information: Float64  # [6, 6] of exp(xi) T_cw
+    excess: float  # of squared errors over what alignment claims
     sights: Sights
     inliers: int
     found: float  # share of the patches looked for that were found
@@ -72,33 +75,53 @@ def join(parts: Sequence[Sights]) -> Sights:
     return Sights(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("keyframe", "patch", "uv", "information")))
 
 
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A pose and how well its patches agree with it."""
+
+    T_cw: Float64
+    error: Float64  # [E] px, reprojection errors
+    information: Float64  # [6, 6] of exp(xi) T_cw
+    excess: float  # squared errors relative to what their standard deviations say, at least 1
+
+
 def solve_pose(
     camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64, information: Float64, scales: Sequence[float]
-) -> tuple[Float64, Float64]:
+) -> Solution:
     """Robust pose of a camera from patches in the world, near ``T_cw``; Gauss-Newton.
 
     Args:
         X: [E, 3] scaled points, world position times inverse depth ``w`` [E].
         uv, information: [E, 2] px and [E, 2, 2] where they were seen.
         scales: where the robust kernel sets in, standard deviations; narrower from one to the next.
-
-    Returns:
-        The pose and the reprojection errors [E] px there.
     """
-    root, away = information_root(information), np.zeros(6)
+    claimed, excess = information_root(information), 1.0
+    away, H = np.zeros(6), np.zeros((6, 6))
     for scale in scales:
+        # Errors beyond what alignment claims (rolling shutter, depth registered badly) widen the kernel.
+        root = claimed / np.sqrt(excess)
         for _ in range(_STEPS):
             r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
             white = whiten(r, root)  # [2, E]
             weight = np.sqrt(robust((white**2).sum(axis=0), scale)[0])
             J, _ = jacobians(camera, Xc, w, np.zeros(3), root * weight[:, None])
             J = J.reshape(6, -1)
-            step = np.linalg.solve(J @ J.T + _PRIOR, J @ (white * weight).ravel() - _PRIOR @ away)
+            H = J @ J.T
+            step = np.linalg.solve(H + _PRIOR, J @ (white * weight).ravel() - _PRIOR @ away)
             T_cw, away = se3.exp(step) @ T_cw, away + step
             if np.abs(step).max() < _STILL:
                 break
-    r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
-    return se3.orthonormalise(T_cw), np.where(Xc[:, 2] > _BEHIND, np.linalg.norm(r, axis=1), np.inf)
+        r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
+        excess = _excess(whiten(r, claimed))
+    error = np.where(Xc[:, 2] > _BEHIND, np.linalg.norm(r, axis=1), np.inf)
+    return Solution(se3.orthonormalise(T_cw), error, H, excess)
+
+
+def _excess(white: Float64) -> float:
+    """How much larger squared errors [2, E] are than their standard deviations say, at least 1."""
+    if white.shape[1] == 0:
+        return 1.0
+    return max(1.0, float(np.median((white**2).sum(axis=0))) / _MEDIAN_CHI2)
 
 
 def _reprojection_error(camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64) -> tuple[Float64, Float64]:
@@ -146,10 +169,10 @@ class Locator:
             if len(parts[-1]) > 0.5 * _SEARCHED:
                 break
         sights = join(parts)
-        T_cw, error = self._pose(window, sights, predicted, (*_WIDE_SCALES, self._config.robust_sigmas))
-        agreeing = int((error < 2 * self._config.inlier_px).sum())
+        solved = self._pose(window, sights, predicted, (*_WIDE_SCALES, self._config.robust_sigmas))
+        agreeing = int((solved.error < 2 * self._config.inlier_px).sum())
         enough = agreeing >= self._config.min_inliers and agreeing > _AGREEING * len(sights)
-        return T_cw if enough else None
+        return solved.T_cw if enough else None
 
     def align(
         self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, every: bool = False
@@ -170,18 +193,21 @@ class Locator:
             parts.append(align_sights(self._operator, view, index, keyframe, at, take))
         sights = join(parts)
         scale = self._config.robust_sigmas
-        T_cw, error = self._pose(window, sights, T_cw, (3 * scale, scale))
-        inliers = int((error < self._config.inlier_px).sum())
+        solved = self._pose(window, sights, T_cw, (3 * scale, scale, scale))
+        inliers = int((solved.error < self._config.inlier_px).sum())
         if inliers < self._config.min_inliers or inliers < 0.3 * len(sights):
             return None
         newest = len(window) - 1
         share = float((sights.keyframe == newest).sum()) / max(1, int((owner == newest).sum()))
         overlap = share * float(ats[-1].visible.mean())
-        return Location(T_cw, sights, inliers, len(sights) / max(1, len(owner)), overlap)
+        sights = replace(sights, information=sights.information / solved.excess)
+        return Location(
+            solved.T_cw, solved.information, solved.excess, sights, inliers, len(sights) / max(1, len(owner)), overlap
+        )
 
     def _pose(
         self, window: Sequence[TrackedKeyframe], sights: Sights, T_cw: Float64, scales: Sequence[float]
-    ) -> tuple[Float64, Float64]:
+    ) -> Solution:
         """Pose from sights whose information counts the uncertain depth of their patches."""
         X, w = np.zeros((len(sights), 3)), np.zeros(len(sights))
         covariance = np.linalg.inv(sights.information)

@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -17,6 +17,7 @@ from sf_tracking.core.keyframes import wants_keyframe
 from sf_tracking.core.locate import Location, Locator
 from sf_tracking.core.patches import to_gray
 from sf_tracking.core.search import relocate
+from sf_tracking.core.shape import fit, shape_of
 from sf_tracking.core.update import PatchAlignment, UpdateOperator, View
 from sf_tracking.core.window import Window
 
@@ -89,6 +90,8 @@ class Tracker:
         if not len(self._window):
             return self._start(frame, view)
         found = self._find(frame.stamp_ns, view, camera)
+        if found is not None and self._config.shape_trust:
+            found = self._fit_shape(frame, found)
         if found is None:
             self.state = TrackingState.LOST
             self._recent.clear()
@@ -160,6 +163,17 @@ class Tracker:
         T_cw = relocate(window, view.gray, camera, self._config)
         return None if T_cw is None else self._locate(window, view, T_cw, wide=False)
 
+    def _fit_shape(self, frame: Frame, found: Location) -> Location:
+        """The pose that also aligns the frame's depth with the newest keyframe's, weighed by both informations."""
+        newest, shape = self._window.keyframes[-1], shape_of(frame, self._config)
+        if shape is None or newest.shape is None:
+            return found
+        T = newest.T_cw @ se3.inverse(found.T_cw)
+        back = np.linalg.inv(se3.adjoint(T))
+        c, prior = self._config, back.T @ found.information @ back
+        fitted = fit(newest.camera, shape, newest.shape, T, prior, c.shape_trust)
+        return found if fitted is None else replace(found, T_cw=se3.inverse(fitted.T) @ newest.T_cw)
+
     def _remember(self, frame: Frame, view: View, found: Location) -> tuple[Keyframe, ...]:
         """Store the frame relative to the newest keyframe, or make it a keyframe and optimise the window."""
         newest = self._window.keyframes[-1]
@@ -172,7 +186,7 @@ class Tracker:
         if keyframe is None:
             self._relative[frame.stamp_ns] = (newest.frame.stamp_ns, newest.T_cw @ se3.inverse(found.T_cw))
             return ()
-        self._window.add(keyframe, found.sights)
+        self._window.add(keyframe, found)
         self._window.optimise()
         return (self._retire(),) if self._window.full else ()
 

@@ -6,12 +6,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.bundle import Problem, adjust, information_root
 from sf_tracking.core.keyframes import TrackedKeyframe, reproject
-from sf_tracking.core.locate import Sights, align_sights
+from sf_tracking.core.locate import Location, align_sights
 from sf_tracking.core.patches import Measured, Patches, extract
+from sf_tracking.core.shape import fit, shape_of
 from sf_tracking.core.update import UpdateOperator, View, search
 
 _GUESS = 0.5  # relative deviation of an inverse depth that is only expected from its neighbours
@@ -44,7 +46,8 @@ class Window:
         camera = frame.camera
         assert camera is not None
         patches = self._patches(camera, T_cw, uv, found)
-        return TrackedKeyframe(frame, view, patches, self._operator.describe(view, uv), T_cw)
+        shape = shape_of(frame, self._config) if self._config.shape_trust else None
+        return TrackedKeyframe(frame, view, patches, self._operator.describe(view, uv), T_cw, shape=shape)
 
     def _patches(self, camera: Camera, T_cw: Float64, uv: Float64, found: Measured) -> Patches:
         """Patches that start at their measured depth, or at what their neighbours let expect."""
@@ -68,17 +71,24 @@ class Window:
         near = cKDTree(place).query(uv, k=_NEIGHBOURS)[1]
         return np.asarray(np.median(np.concatenate(depths)[near], axis=1))
 
-    def add(self, keyframe: TrackedKeyframe, sights: Sights) -> None:
+    def add(self, keyframe: TrackedKeyframe, found: Location) -> None:
         """Append a keyframe in which the window's patches were seen, and look for its patches in the window."""
-        stamp = keyframe.frame.stamp_ns
+        stamp, sights = keyframe.frame.stamp_ns, found.sights
         for index, source in enumerate(self.keyframes):
             mine = sights.keyframe == index
             _remember(source, stamp, sights.patch[mine], sights.uv[mine], sights.information[mine])
         for target in self.keyframes:
-            self._observe(keyframe, target)
+            self._observe(keyframe, target, found.excess)
+        for target in self.keyframes[-self._config.shape_keyframes :]:
+            if keyframe.shape is not None and target.shape is not None:
+                T = target.T_cw @ se3.inverse(keyframe.T_cw)
+                c = self._config
+                found = fit(keyframe.camera, keyframe.shape, target.shape, T, np.eye(6), c.shape_trust)
+                if found is not None:
+                    keyframe.moved[target.frame.stamp_ns] = found
         self.keyframes.append(keyframe)
 
-    def _observe(self, source: TrackedKeyframe, target: TrackedKeyframe) -> None:
+    def _observe(self, source: TrackedKeyframe, target: TrackedKeyframe, excess: float) -> None:
         """Look for the patches of ``source`` in ``target``; over levels where their depth is only guessed."""
         at = reproject(source, target.T_cw)
         take = np.flatnonzero(at.visible)
@@ -90,7 +100,7 @@ class Window:
             at.uv[guessed] = uv
             take = np.sort(np.r_[take[source.patches.measured[take]], guessed[ok]])
         sights = align_sights(self._operator, target.view, 0, source, at, take)
-        _remember(source, target.frame.stamp_ns, sights.patch, sights.uv, sights.information)
+        _remember(source, target.frame.stamp_ns, sights.patch, sights.uv, sights.information / excess)
 
     def optimise(self, fixed: int = 2, iterations: int | None = None) -> None:
         """Bundle adjustment of the window; the ``fixed`` oldest keyframes hold the gauge."""
@@ -123,7 +133,13 @@ class Window:
             for stamp, (where, how_sure) in keyframe.seen.items():
                 if stamp in index:
                     uv[i, index[stamp], :k], information[i, index[stamp], :k] = where, how_sure
-        return Problem(np.stack([k.T_cw for k in keyframes]), rays, w, prior, weight, uv, information_root(information))
+        motion, sure = np.broadcast_to(np.eye(4), (n, n, 4, 4)).copy(), np.zeros((n, n, 6, 6))
+        for i, keyframe in enumerate(keyframes):
+            for stamp, shape_fit in keyframe.moved.items():
+                if stamp in index:
+                    motion[i, index[stamp]], sure[i, index[stamp]] = shape_fit.T, shape_fit.information
+        poses, root = np.stack([k.T_cw for k in keyframes]), information_root(information)
+        return Problem(poses, rays, w, prior, weight, uv, root, motion, sure)
 
     def rescale(self, unit: float) -> None:
         """Multiply all lengths by ``unit``, 1/m."""

@@ -31,7 +31,8 @@ def scene(seed: int, n: int = 4, m: int = 25, noise: float = 0.0, outliers: int 
     uv[:, :, :outliers] += 40.0
     information = np.broadcast_to(np.array([[1.0, 0.2], [0.2, 0.7]]), (n, n, m, 2, 2)).copy()
     information[np.arange(n), np.arange(n)] = 0.0
-    truth = Problem(T, rays, w, w, np.zeros((n, m)), uv, information_root(information))
+    no_motion = np.broadcast_to(np.eye(4), (n, n, 4, 4)), np.zeros((n, n, 6, 6))
+    truth = Problem(T, rays, w, w, np.zeros((n, m)), uv, information_root(information), *no_motion)
     start = se3.exp(rng.normal(0, 0.02, (n, 6))) @ T
     start[0] = T[0]
     return truth, replace(truth, T_cw=start, w=w * rng.uniform(0.8, 1.25, w.shape))
@@ -117,6 +118,16 @@ def test_outliers_lose_their_weight() -> None:
     found, _ = adjust(CAMERA, start, np.arange(4) >= 1, 3.0, 40)
     error = np.linalg.norm(se3.inverse(found.T_cw)[:, :3, 3] - se3.inverse(truth.T_cw)[:, :3, 3], axis=1)
     assert error.max() < 0.005  # m; without the robust kernel the outliers move poses by decimetres
+
+
+def test_measured_motions_pull_as_strongly_as_they_are_sure() -> None:
+    truth, start = scene(3)
+    motion = truth.T_cw[None] @ se3.inverse(truth.T_cw)[:, None]
+    sure = np.zeros((4, 4, 6, 6))
+    sure[1:, 0] = 1e8 * np.eye(6)  # of keyframe 0 relative to each other one
+    blind = replace(start, root=np.zeros_like(start.root), motion=motion, motion_information=sure)
+    found, _ = adjust(CAMERA, blind, np.arange(4) >= 1, 3.0, 20)
+    np.testing.assert_allclose(found.T_cw, truth.T_cw, atol=1e-6)
 
 
 def test_a_patch_never_seen_stays_where_it_is() -> None:
