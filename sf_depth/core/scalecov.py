@@ -22,7 +22,7 @@ from sf_depth.core.conditioning import Observations, choose, observe
 from sf_depth.core.covariance import CovarianceModel, PixelCovariance, make_covariance
 from sf_depth.core.layers import at, layer, look, reliability
 from sf_interfaces.errors import FormatError
-from sf_interfaces.types import DepthMap, Float32, Float64, UInt8
+from sf_interfaces.types import DepthMap, Float32, UInt8
 
 MIN_OBSERVATIONS = 4  # a plane and one to spare
 _CHUNK = 1024  # tiles solved at once; few enough to stay in the processor's cache
