@@ -16,6 +16,11 @@ constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr int32_t kClosed = static_cast<int32_t>(0xff800000u);  // bits of -inf
 constexpr float kHole = std::numeric_limits<float>::quiet_NaN();
 
+constexpr float kMinStep = 1e-5f;  // of the depth; pixels that show the same point differ by rounding only
+constexpr float kMinSine = 1e-2f;  // of the angle between two differences that span a surface
+
+inline float norm_of(const float* v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
+
 struct Item {  // a fragment to be sorted
     uint64_t key;     // bits of the depth (positive floats sort like their bits) above the row in the cloud
     uint32_t window;  // x0 | x1 << 8 | y0 << 16 | y1 << 24, pixels of the tile
@@ -189,7 +194,7 @@ void blend_normals(const RasterSpec& s, const float* normals, const Fragment* fr
         const float towards = m[0] * position[0] + m[1] * position[1] + m[2] * position[2] > 0.0f ? -1.0f : 1.0f;
         for (int a = 0; a < 3; ++a) sum[a] += towards * weight * m[a];
     }
-    const float norm = std::sqrt(sum[0] * sum[0] + sum[1] * sum[1] + sum[2] * sum[2]);
+    const float norm = norm_of(sum);
     for (int a = 0; a < 3; ++a) out[a] = norm > 1e-6f * total && total > 0.0f ? sum[a] / norm : kHole;
 }
 
@@ -265,9 +270,11 @@ void normals_of(const float* position, int width, int height, float layer_gap, i
             const float *a = same_layer(u, v - 1), *b = same_layer(u, v + 1);
             const float x[3] = {r[0] - l[0], r[1] - l[1], r[2] - l[2]}, y[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
             float n[3] = {y[1] * x[2] - y[2] * x[1], y[2] * x[0] - y[0] * x[2], y[0] * x[1] - y[1] * x[0]};
-            const float norm = std::sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+            const float norm = norm_of(n);
+            const float across = norm_of(x), down = norm_of(y);
+            const bool sound = std::min(across, down) > kMinStep * p[2] && norm > kMinSine * across * down;
             float* out = normal + 3 * (static_cast<size_t>(v) * width + u);
-            for (int c = 0; c < 3; ++c) out[c] = norm > 0.0f ? n[c] / norm : kHole;
+            for (int c = 0; c < 3; ++c) out[c] = sound ? n[c] / norm : kHole;
         }
 }
 
