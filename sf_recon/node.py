@@ -12,7 +12,6 @@ from rclpy.task import Future
 
 from sf_interfaces import topics
 from sf_interfaces.errors import SceneFactoryError
-from sf_interfaces.io.cloud import write_surface
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
@@ -103,11 +102,7 @@ class ReconNode(BlockNode):
         self.output(topics.SURFACE).publish(messages.encode_cloud(messages.rclpy_factory, placed))
 
     def _save(self, folder: Path) -> list[Path]:
-        surface = self._reconstruction.surface()
-        paths = [folder / "map.sfmap", folder / "surface.ply"]
-        self._reconstruction.save(paths[0])
-        write_surface(paths[1], surface)
-        return paths
+        return self._reconstruction.save_products(folder)
 
     def _view(self, msg: Any) -> None:
         wanted = [topic for topic in (topics.VIEW_IMAGE, topics.VIEW_DEPTH) if self.wanted(topic)]
