@@ -120,7 +120,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from sf_bringup.products import render_views
+    from sf_bringup.looking import render_views
 
     count = render_views(args.run, args.poses, args.out)
     _print({"views": count}, args.json, f"wrote {count} views to {args.out}")
@@ -128,9 +128,9 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _view(args: argparse.Namespace) -> int:
-    from sf_bringup.products import view
+    from sf_bringup.looking import view
 
-    view(args.run)
+    view(args.run, args.host, args.port, lambda url: _print({"url": url}, args.json, f"{url}   (Ctrl-C ends)"))
     return 0
 
 
@@ -220,7 +220,10 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("run", type=Path)
     p.add_argument("--poses", type=Path, required=True, help="T_map_camera in TUM format")
     p.add_argument("--out", type=Path, required=True)
-    verb("view", _view, "show the surface of a finished run").add_argument("run", type=Path)
+    p = verb("view", _view, "serve a page that shows the map of a finished run")
+    p.add_argument("run", type=Path)
+    p.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
+    p.add_argument("--port", type=int, default=8080)
 
     p = verb("export", _export, "write the results of a run in other formats")
     p.add_argument("run", type=Path)

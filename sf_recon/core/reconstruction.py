@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -153,6 +154,16 @@ class Reconstruction:
             z = np.full((camera.height, camera.width), np.nan, np.float32)
             return RenderedView(np.zeros((*z.shape, 3), np.uint8), DepthMap(z))
         return self._renderer.render(camera, T_map_camera, self.views, self.scale, full=full)
+
+    def serve(self, host: str, port: int) -> Any:
+        """A page that shows the map, see :class:`sf_recon.core.viewer.Viewer`.
+
+        Raises:
+            ConfigError: viser is not installed.
+        """
+        from sf_recon.core.viewer import Viewer
+
+        return Viewer(self, host, port)
 
     def save(self, path: Path) -> None:
         """Write the map (.sfmap): points, features, network, keyframe images and configuration."""
