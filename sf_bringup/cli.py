@@ -175,6 +175,12 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
+    parser.add_argument("--port", type=int, default=8080)
+
+
 def build_parser() -> argparse.ArgumentParser:
     """The parser alone, without importing any block: help and completion stay fast."""
     parser = argparse.ArgumentParser(
@@ -220,10 +226,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("run", type=Path)
     p.add_argument("--poses", type=Path, required=True, help="T_map_camera in TUM format")
     p.add_argument("--out", type=Path, required=True)
-    p = verb("view", _view, "serve a page that shows the map of a finished run")
-    p.add_argument("run", type=Path)
-    p.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
-    p.add_argument("--port", type=int, default=8080)
+    _add_view(verb("view", _view, "serve a page that shows the map of a finished run"))
 
     p = verb("export", _export, "write the results of a run in other formats")
     p.add_argument("run", type=Path)

@@ -6,6 +6,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import torch
 
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, PointCloud, Scale, Trajectory, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, PointCloud, Scale, Trajectory
 from sf_recon.config import MESHES, ReconConfig
 from sf_recon.core import map_file, memory, products
 from sf_recon.core.color_field import ColorField
@@ -81,7 +82,7 @@ class Reconstruction:
         """
         added = self.place(keyframe)
         self._trainer.run(self.config.iterations)
-        return PointCloud(added, self._colors(added), stamp_ns=keyframe.stamp_ns, frame_id="map")
+        return self.colored(added, keyframe.stamp_ns)
 
     def place(self, keyframe: Keyframe) -> Float32:
         """Place points for a keyframe and take it into training; the added finest points [M, 3] m, map frame.
@@ -140,7 +141,12 @@ class Reconstruction:
         if self._points is None:
             return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), frame_id="map")
         points = np.concatenate([self._points.tops(i) for i in range(len(self._points.levels))])
-        return PointCloud(points, self._colors(points), frame_id="map")
+        return self.colored(points)
+
+    def colored(self, points: Float32, stamp_ns: int = 0) -> PointCloud:
+        """Points [N, 3] m, map frame, with the field's colour from no side."""
+        colors = np.rint(255 * self._field.color(points)).astype(np.uint8)
+        return PointCloud(points, colors, stamp_ns=stamp_ns, frame_id="map")
 
     def depth(self, camera: Camera, T_map_camera: Float64) -> Float32:
         """Depth [H, W] m of the surface seen from a pose, NaN = hole."""
@@ -155,15 +161,15 @@ class Reconstruction:
             return RenderedView(np.zeros((*z.shape, 3), np.uint8), DepthMap(z))
         return self._renderer.render(camera, T_map_camera, self.views, self.scale, full=full)
 
-    def serve(self, host: str, port: int) -> Any:
-        """A page that shows the map, see :class:`sf_recon.core.viewer.Viewer`.
+    def serve(self, host: str, port: int, lock: AbstractContextManager[Any] | None = None) -> Any:
+        """A page that shows the map, see :class:`sf_recon.core.viewer.Viewer`; it reads the map under ``lock``.
 
         Raises:
             ConfigError: viser is not installed.
         """
         from sf_recon.core.viewer import Viewer
 
-        return Viewer(self, host, port)
+        return Viewer(self, host, port, lock)
 
     def save(self, path: Path) -> None:
         """Write the map (.sfmap): points, features, network, keyframe images and configuration."""
@@ -239,6 +245,3 @@ class Reconstruction:
             weights.reshape(-1)[seen.pixels] = seen.weights
         T, image = keyframe.T_map_camera, rgb(keyframe.image)
         return KeyframeView.make(keyframe.stamp_ns, keyframe.camera, T, image, depth, weights)
-
-    def _colors(self, points: Float32) -> UInt8:
-        return np.rint(255 * self._field.color(points)).astype(np.uint8)
