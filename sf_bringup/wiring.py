@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +21,7 @@ _ROLE_TOPIC = {
     "lidar": topics.LIDAR_POINTS.name,
     "pose": topics.GIVEN_POSE.name,
 }
+_STREAM = {"rgb": "image", "depth": "depth"}  # role -> stream that may come compressed
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,13 @@ def sync_values(plan: Plan, roles: Mapping[str, str], step: Step) -> dict[str, b
 
 
 def launches(
-    plan: Plan, roles: Mapping[str, str], config: ConfigFile, *, lossless: bool, out: str = ""
+    plan: Plan,
+    roles: Mapping[str, str],
+    config: ConfigFile,
+    *,
+    lossless: bool,
+    out: str = "",
+    compressed: Collection[str] = (),
 ) -> tuple[NodeLaunch, ...]:
     """The processes of a plan, in its order.
 
@@ -64,6 +71,7 @@ def launches(
         config: sections that become node parameters.
         lossless: replay without dropping.
         out: folder for the nodes' files, empty for none.
+        compressed: roles whose topic carries CompressedImage.
     """
     plan.check_runnable()
     first = plan.steps[0]
@@ -71,7 +79,8 @@ def launches(
         raise PlanError(
             "single frames without poses are completed in one process: leave --engine ros out, or use --goal recon"
         )
-    return tuple(_launch(plan, step, roles, config, lossless, out) for step in plan.steps)
+    streams = [_STREAM[role] for role in roles if role in compressed]
+    return tuple(_launch(plan, step, roles, config, lossless, out, streams) for step in plan.steps)
 
 
 def _source(step: Step) -> str:
@@ -84,7 +93,13 @@ def _source(step: Step) -> str:
 
 
 def _launch(
-    plan: Plan, step: Step, roles: Mapping[str, str], config: ConfigFile, lossless: bool, out: str
+    plan: Plan,
+    step: Step,
+    roles: Mapping[str, str],
+    config: ConfigFile,
+    lossless: bool,
+    out: str,
+    compressed: Sequence[str],
 ) -> NodeLaunch:
     source = _source(step)
     flexion = step.spec.name != "flexion" and source == "sensors" and step.sources.get(Q.IMAGE) == "flexion"
@@ -95,7 +110,8 @@ def _launch(
         remaps[topics.RGB_IMAGE.name] = topics.FLEXION_IMAGE.name
     parameters |= dict(config.sections.get(step.spec.name, {}))
     if source == "sensors":
-        sync = {**sync_values(plan, roles, step), **config.sections.get("sync", {})}
+        carried = [stream for stream in compressed if not (flexion and stream == "image")]
+        sync = {**sync_values(plan, roles, step), "compressed": carried, **config.sections.get("sync", {})}
         parameters |= {f"sync.{key}": value for key, value in sync.items()}
         remaps |= {
             own: roles[role]

@@ -18,6 +18,8 @@ from rclpy.task import Future
 
 from sf_interfaces import topics
 from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.io.atomic import replace_file
+from sf_interfaces.io.paths import inside
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.inbox import Inbox
 from sf_interfaces.ros.keyframes import KeyframeSource
@@ -27,6 +29,8 @@ from sf_interfaces.types import Camera, Keyframe, PointCloud
 from sf_recon.config import ReconConfig
 from sf_recon.core.learner import FairLock, Learner
 from sf_recon.core.reconstruction import Reconstruction
+
+_SNAPSHOT_KEYFRAMES = 15  # upstream keeps twice as many for a restarted node
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +59,10 @@ class ReconNode(BlockNode):
     def setup(self) -> None:
         """The reconstruction and its keyframes."""
         self.leader = ""
-        self._reconstruction = Reconstruction(self.config())
+        saved = self.snapshot("recon.sfmap")
+        self._reconstruction = Reconstruction(self.config()) if saved is None else Reconstruction.load(saved)
         self._source = KeyframeSource(self, landmarks=False)
+        self._unsaved, self._resumed = 0, saved is not None
         self._camera: Camera | None = None
         self._last_ns = 0
         self._lock = FairLock()
@@ -73,6 +79,8 @@ class ReconNode(BlockNode):
         self.listen(topics.VIEW_POSE, "view", 1)
         for topic in (topics.SURFACE, topics.VIEW_IMAGE, topics.VIEW_DEPTH):
             self.output(topic)
+        if self._resumed:
+            self._publish_surface(self._reconstruction.surface())
 
     def take(self, kind: str, msg: Any) -> None:
         """Add keyframes; render and save between them."""
@@ -99,7 +107,7 @@ class ReconNode(BlockNode):
             self._learner.stop()
             if self.out is not None:
                 self._learner.write_timing(self.out / "timing.json")
-        if self._camera is None:
+        if self._camera is None and not self._resumed:
             self.health.error("nothing was reconstructed: no keyframe with depth arrived")
             return
         with self._lock:
@@ -133,6 +141,12 @@ class ReconNode(BlockNode):
         self.health.count("points", len(added))
         self._publish_surface(added)
         self.sent_one(keyframe.stamp_ns)
+        self._unsaved += 1
+        if self._unsaved >= _SNAPSHOT_KEYFRAMES and (path := self.state("recon.sfmap")) is not None:
+            with self._lock, replace_file(path) as draft:
+                self._reconstruction.save(draft)
+            self._source.done(keyframe.stamp_ns)
+            self._unsaved = 0
 
     def _publish_surface(self, cloud: PointCloud) -> None:
         placed = PointCloud(cloud.points, cloud.colors, stamp_ns=self._last_ns, frame_id="map")
@@ -202,16 +216,16 @@ class ReconNode(BlockNode):
             response.image, response.depth = self._render(camera, request.pose)
 
     def _save_service(self, request: Any, response: Any) -> None:
-        if self._camera is None:
+        if self._camera is None and not self._resumed:
             response.message = "nothing is reconstructed yet; call again after the first keyframe"
             return
         try:
-            folder = Path(request.directory)
+            folder = inside(self.out, request.directory)
             folder.mkdir(parents=True, exist_ok=True)
             response.paths = [str(path) for path in self._save(folder)]
             response.success = True
         except (OSError, SceneFactoryError) as error:
-            response.message = f"cannot save to {request.directory}: {error}"
+            response.message = f"cannot save to '{request.directory}': {error}"
 
 
 def main() -> int:

@@ -16,7 +16,8 @@ from sf_interfaces.ros.process import run
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.types import Float64, Frame, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.tracker import Tracker, TrackingUpdate
+from sf_tracking.core.session import TrackingSession
+from sf_tracking.core.tracker import TrackingUpdate
 
 _PATH_EVERY_NS = 1_000_000_000
 
@@ -41,11 +42,11 @@ class TrackingNode(BlockNode):
         for topic in (topics.TRACKING_POSE, topics.TRACKING_PATH, topics.TF, *TRACKED.values()):
             self.output(topic)
         self._begin()
+        if (snapshot := self.snapshot("tracking.npz")) is not None:
+            self._tracker = TrackingSession.restore(self._config, snapshot)
 
     def _begin(self) -> None:
-        self._tracker = Tracker(self._config)
-        self._keyframes: list[tuple[int, Float64]] = []
-        self._scale = Scale.METRIC
+        self._tracker = TrackingSession(self._config)
         self._path_stamp_ns: int | None = None
         self._epoch = self._inputs.assembler.epoch
 
@@ -62,7 +63,7 @@ class TrackingNode(BlockNode):
         trajectory = self._tracker.trajectory()
         if self.out is not None:
             write_tum(self.out / "trajectory.tum", trajectory)
-            write_tum(self.out / "keyframes.tum", Trajectory.from_pairs(self._keyframes, trajectory.scale))
+            write_tum(self.out / "keyframes.tum", self._tracker.keyframe_trajectory())
         self._publish_path(trajectory)
 
     def refresh(self) -> None:
@@ -98,10 +99,11 @@ class TrackingNode(BlockNode):
 
     def _send_keyframes(self, update: TrackingUpdate) -> None:
         for keyframe in update.keyframes:
-            self._keyframes.append((keyframe.stamp_ns, keyframe.T_map_camera))
             publish_bundle(self, keyframe, TRACKED, set(TRACKED))
             self.health.count("keyframes")
             self.sent_one(keyframe.stamp_ns)
+        if update.keyframes and (path := self.state("tracking.npz")) is not None:
+            self._tracker.save(path)
 
     def _publish_path(self, trajectory: Trajectory) -> None:
         if len(trajectory):

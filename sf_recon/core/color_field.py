@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sf_interfaces.types import Float32
-from sf_recon.core.neural_points import Added, NeuralPoints
+from sf_interfaces.types import Float32, Float64
+from sf_recon.core.kernels import ColorNetwork, FieldLevel, decode_colors
+from sf_recon.core.neural_points import SEARCH_RADIUS, Added, NeuralPoints
 
 INITIAL_FEATURE = 0.5
 HARMONICS = 8  # real spherical harmonics of degrees 1 and 2, up to constants
@@ -132,16 +133,41 @@ class ColorField(torch.nn.Module):
             base = base + has * (encoded[:, level * width : level * width + 3] - base)
         return base
 
-    @torch.no_grad()
-    def color(self, queries: Float32, directions: Float32 | None = None, batch: int = 65536) -> Float32:
-        """RGB [N, 3] in 0..1 of surface points [N, 3] m, map frame, seen along unit directions [N, 3] (None: none)."""
-        out = [np.zeros((0, 3), np.float32)]
-        for start in range(0, len(queries), batch):
-            part = slice(start, start + batch)
-            near = self.neighbourhoods(queries[part])
-            seen = None if directions is None else directions[part]
-            out.append(self.decode(self.encode(near), near, seen).numpy())
-        return np.concatenate(out)
+    def color(self, queries: Float32, eye: Float64 | None = None, level: int = 0) -> Float32:
+        """RGB [N, 3] in 0..1 of surface points [N, 3] m, map frame, by the compiled decoder.
+
+        Args:
+            queries: points, best in an order in which neighbours follow one another.
+            eye: camera centre [3] m they are seen from; None: from no side.
+            level: the finest level that has points near the queries.
+        """
+        if len(queries) == 0:
+            return np.zeros((0, 3), np.float32)
+        levels = [
+            FieldLevel(near.grid, table.numpy(), SEARCH_RADIUS * near.spacing, self.sigma * near.spacing**2)
+            for near, table in zip(self.points.levels, self.features, strict=True)
+        ]
+        degree = 2 if self.view_directions and eye is not None else 0
+        network = ColorNetwork(self._layers(level, degree > 0), self.neighbours, degree)
+        return decode_colors(queries, levels, network, eye if degree else None, threads=self.threads)
+
+    def _layers(self, level: int, sided: bool) -> list[tuple[Float32, Float32]]:
+        """The network with the colour features led past it: x = relu(x) - relu(-x), through two more units each."""
+        linear = [(m.weight.detach().numpy(), m.bias.detach().numpy()) for m in self.network[::2]]  # type: ignore[union-attr]
+        columns = self.features[0].shape[1] * len(self.features)
+        first = linear[0][0] if sided or not self.view_directions else linear[0][0][:, :columns]
+        both = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)  # [6, 3]
+        led = np.zeros((6, first.shape[1]), np.float32)
+        start = level * self.features[0].shape[1]
+        led[:, start : start + 3] = both
+        out = [(np.concatenate([first, led]), np.concatenate([linear[0][1], np.zeros(6, np.float32)]))]
+        for weight, bias in linear[1:-1]:
+            wide = np.zeros((len(weight) + 6, weight.shape[1] + 6), np.float32)
+            wide[: len(weight), : weight.shape[1]] = weight
+            wide[len(weight) :, weight.shape[1] :] = np.eye(6)
+            out.append((wide, np.concatenate([bias, np.zeros(6, np.float32)])))
+        out.append((np.concatenate([linear[-1][0], both.T], axis=1), linear[-1][1]))
+        return [(np.ascontiguousarray(w), np.ascontiguousarray(b)) for w, b in out]
 
 
 def _interpolate(rows: Tensor, near: Neighbourhood) -> Tensor:

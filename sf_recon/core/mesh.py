@@ -68,8 +68,8 @@ def poisson(reconstruction: Reconstruction) -> Mesh:
     voxel = _voxel(reconstruction)
     cloud = o3d.geometry.PointCloud()
     for camera, T_map_camera, z, image in _drawn(reconstruction):
-        normal = normals(camera, z, jump=2 * voxel)
-        good = np.isfinite(normal[..., 0])
+        normal = normals(camera, z, 2 * voxel)
+        good = np.isfinite(normal[..., 0]) & np.isfinite(z)
         local = camera.unproject(camera.pixel_grid()[good], z[good].astype(np.float64))
         part = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(se3.transform(T_map_camera, local)))
         part.normals = o3d.utility.Vector3dVector(normal[good] @ T_map_camera[:3, :3].T)

@@ -57,12 +57,12 @@ class Level:
     def __init__(self, spacing: float) -> None:
         self.spacing = spacing
         self.runs: list[tuple[int, int]] = []
-        self._grid: Any = native().PointGrid(CELL * spacing)
+        self.grid: Any = native().PointGrid(CELL * spacing)
         self._points: list[Float32] = []
         self._sigmas: list[NDArray[np.float16]] = []
 
     def __len__(self) -> int:
-        return len(self._grid)
+        return len(self.grid)
 
     @property
     def points(self) -> Float32:
@@ -83,7 +83,7 @@ class Level:
     def extend(self, samples: Float32, stamp_ns: int) -> Added:
         """Add the samples (rows x y z r g b sigma) that lie farther than the spacing from every point so far."""
         positions = np.ascontiguousarray(samples[:, :3])
-        rows, parents = self._grid.add_spaced(positions, self.spacing, COPY_RADIUS * self.spacing)
+        rows, parents = self.grid.add_spaced(positions, self.spacing, COPY_RADIUS * self.spacing)
         added = Added(positions[rows], np.ascontiguousarray(samples[rows, 3:6]), parents)
         self._points.append(added.points)
         self._sigmas.append(samples[rows, 6].clip(0, 6e4).astype(np.float16))
@@ -93,8 +93,8 @@ class Level:
 
     def replace(self, points: Float32, sigmas: NDArray[np.float16], runs: list[tuple[int, int]]) -> None:
         """Take over other points in their order; builds the grid anew."""
-        self._grid = native().PointGrid(CELL * self.spacing)
-        self._grid.add(np.ascontiguousarray(points, dtype=np.float32))
+        self.grid = native().PointGrid(CELL * self.spacing)
+        self.grid.add(np.ascontiguousarray(points, dtype=np.float32))
         self._points, self._sigmas, self.runs = [points], [sigmas], runs
 
     def keep(self, mask: NDArray[np.bool_]) -> None:
@@ -107,7 +107,7 @@ class Level:
     def nearest(self, queries: Float32, k: int, threads: int = 0, radius: float = 0.0) -> tuple[Int32, Float32]:
         """Ids [N, k] (-1: none) and squared distances [N, k] m^2 (inf), nearest first, in ``radius`` (0: four)."""
         radius = radius or SEARCH_RADIUS * self.spacing
-        ids, d2 = self._grid.knn(np.ascontiguousarray(queries, dtype=np.float32), k, radius, threads)
+        ids, d2 = self.grid.knn(np.ascontiguousarray(queries, dtype=np.float32), k, radius, threads)
         return ids, d2
 
 

@@ -140,19 +140,20 @@ class Reconstruction:
         """The finest points with the colour of the field, map frame; coarse ones where there are no finer."""
         if self._points is None:
             return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), frame_id="map")
-        points = np.concatenate([self._points.tops(i) for i in range(len(self._points.levels))])
-        return self.colored(points)
+        clouds = [self.colored(self._points.tops(i), level=i) for i in range(len(self._points.levels))]
+        points, colors = (np.concatenate(part) for part in zip(*((c.points, c.colors) for c in clouds), strict=True))
+        return PointCloud(points, colors, frame_id="map")
 
-    def colored(self, points: Float32, stamp_ns: int = 0) -> PointCloud:
-        """Points [N, 3] m, map frame, with the field's colour from no side."""
-        colors = np.rint(255 * self._field.color(points)).astype(np.uint8)
+    def colored(self, points: Float32, stamp_ns: int = 0, level: int = 0) -> PointCloud:
+        """Points [N, 3] m (map frame) of a level with the field's colour from no side."""
+        colors = np.rint(255 * self._field.color(points, level=level)).astype(np.uint8)
         return PointCloud(points, colors, stamp_ns=stamp_ns, frame_id="map")
 
     def depth(self, camera: Camera, T_map_camera: Float64) -> Float32:
         """Depth [H, W] m of the surface seen from a pose, NaN = hole."""
         if self._points is None:
             return np.full((camera.height, camera.width), np.nan, np.float32)
-        return self._renderer.depth(camera, T_map_camera)
+        return self._renderer.depth(camera, T_map_camera)[0]
 
     def render(self, camera: Camera, T_map_camera: Float64, *, full: bool = False) -> RenderedView:
         """Draw the surface from a pose; ``full`` adds normals and the variance of the depth."""

@@ -14,6 +14,7 @@ from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Scale, UInt8
 from sf_recon.config import ReconConfig
 from sf_recon.core.color_field import ColorField
 from sf_recon.core.detail import detail
+from sf_recon.core.ipr_reference import normals_of
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.neural_points import NeuralPoints
 from sf_recon.core.observation import backproject
@@ -34,23 +35,13 @@ class RenderedView:
         return 1.0 - self.depth.density
 
 
-def normals(camera: Camera, z: Float32, jump: float) -> Float32:
-    """Unit normals [H, W, 3] (optical frame, towards the camera) of a depth image; NaN at its edges.
+def normals(camera: Camera, z: Float32, gap: float) -> Float32:
+    """Unit normals [H, W, 3] (optical frame, towards the camera) of a depth image [H, W] m; NaN = unknown.
 
     Args:
-        jump: difference in depth of neighbouring pixels, m per pixel of their distance, that counts as an edge.
+        gap: step in depth, m, across which pixels do not belong together.
     """
-    points = camera.unproject(camera.pixel_grid(), z.astype(np.float64)).astype(np.float32)
-    out = np.full((*z.shape, 3), np.nan, np.float32)
-    right, down = points[1:-1, 2:] - points[1:-1, :-2], points[2:, 1:-1] - points[:-2, 1:-1]
-    normal = np.cross(down, right)
-    length = np.linalg.norm(normal, axis=2)
-    with np.errstate(invalid="ignore"):
-        smooth = (np.abs(right[..., 2]) < 2 * jump) & (np.abs(down[..., 2]) < 2 * jump) & (length > 0)
-    smooth &= np.isfinite(z[1:-1, 1:-1])
-    inner = out[1:-1, 1:-1]
-    inner[smooth] = normal[smooth] / length[smooth, None]
-    return out
+    return normals_of(camera.unproject(camera.pixel_grid(), z.astype(np.float64)).astype(np.float32), gap)
 
 
 def fill(z: Float32) -> Float32:
@@ -73,19 +64,24 @@ class Renderer:
         self.config, self.points, self.field = config, points, field
         self._draw = make_rasterizer(config)
 
-    def depth(self, camera: Camera, T_map_camera: Float64) -> Float32:
-        """Depth [H, W] m of the first layer, NaN = hole. Coarse points are drawn where no finer ones stand."""
+    def depth(self, camera: Camera, T_map_camera: Float64) -> tuple[Float32, UInt8]:
+        """Depth [H, W] m of the first layer, NaN = hole, and the level of the points that drew it, [H, W].
+
+        Coarse points are drawn where no finer ones stand.
+        """
         T_camera_map = se3.inverse(T_map_camera)
         z = np.full((camera.height, camera.width), np.nan, np.float32)
+        levels = np.zeros(z.shape, np.uint8)
         for index, level in enumerate(self.points.levels):
             drawn = self.points.tops(index)
             if len(drawn) == 0:
                 continue
             options = raster_options(self.config, level.spacing)
-            other = self._draw(drawn, camera, T_camera_map, options).depth
+            other = self._draw(drawn, camera, T_camera_map, options, outputs=()).depth
             with np.errstate(invalid="ignore"):
-                z = np.where(np.isnan(z) | (other + options.layer_gap < z), other, z)
-        return z
+                nearer = np.isfinite(other) & (np.isnan(z) | (other + options.layer_gap < z))
+            z[nearer], levels[nearer] = other[nearer], index
+        return z, levels
 
     def render(
         self,
@@ -98,7 +94,7 @@ class Renderer:
     ) -> RenderedView:
         """Draw the surface from a pose, ``full`` with normals and variance."""
         c = self.config
-        z = self.depth(camera, T_map_camera)
+        z, levels = self.depth(camera, T_map_camera)
         surface = np.isfinite(z)
         image = np.zeros((*z.shape, 3), np.float32)
         trust = np.zeros(z.shape, np.float32)
@@ -106,17 +102,18 @@ class Renderer:
             found = detail(views, camera, T_map_camera, fill(z), surface, count=c.detail, reach=c.detail_reach)
             shown = found.known & (surface | c.fill_holes)
             image[shown], trust = found.color[shown], found.confidence
-        open_ = np.flatnonzero(surface & (trust < 1))
-        if len(open_):
-            learnt = 255 * self.field.color(*backproject(camera, T_map_camera, z.reshape(-1)[open_], open_))
+        for level in range(len(self.points.levels)):
+            open_ = np.flatnonzero(surface & (trust < 1) & (levels == level))
+            points, _ = backproject(camera, T_map_camera, z.reshape(-1)[open_], open_)
+            learnt = 255 * self.field.color(points, T_map_camera[:3, 3], level)
             share, flat = trust.reshape(-1)[open_, None], image.reshape(-1, 3)
             flat[open_] = share * flat[open_] + (1 - share) * learnt
         shown_image = np.rint(np.clip(image, 0, 255)).astype(np.uint8)
         if not full:
             return RenderedView(shown_image, DepthMap(z, scale=scale))
         depth = DepthMap(z, self._variance(camera, T_map_camera, z), scale)
-        jump = c.layer_gap * self.points.levels[0].spacing
-        return RenderedView(shown_image, depth, normals(camera, z, jump))
+        gap = c.layer_gap * self.points.levels[0].spacing
+        return RenderedView(shown_image, depth, normals(camera, z, gap))
 
     def _variance(self, camera: Camera, T_map_camera: Float64, z: Float32) -> Float32:
         """Variance [H, W] m^2 of the nearest point of the finest level that has one near; NaN at holes."""
