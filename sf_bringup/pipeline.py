@@ -25,7 +25,6 @@ from sf_interfaces.blocks import BlockSpec, Quantity
 from sf_interfaces.config import ConfigFile, build
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.io.bag import BagReader
-from sf_interfaces.io.cloud import write_surface
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import write_tum
 from sf_interfaces.ros.sensors import SensorInputs
@@ -203,5 +202,4 @@ def _save(folder: RunFolder, line: ProductionLine, writer: ResultWriter) -> None
         write_tum(folder.path / "keyframes.tum", Trajectory.from_pairs(line.keyframe_poses, trajectory.scale))
         writer.path(trajectory)
     if line.reconstruction is not None:
-        line.reconstruction.save(folder.map)
-        write_surface(folder.path / "surface.ply", line.reconstruction.surface())
+        line.reconstruction.save_products(folder.path)
