@@ -32,6 +32,12 @@ def _overrides(pairs: Sequence[str]) -> dict[str, str]:
     return out
 
 
+def _reading(args: argparse.Namespace) -> Any:
+    from sf_interfaces.io.datasets import ReadOptions
+
+    return ReadOptions(skip_bad=args.skip_bad, use_poses=args.use_poses, depth_scale=args.depth_scale)
+
+
 def _print(value: Any, as_json: bool, text: str) -> None:
     print(json.dumps(value, default=str) if as_json else text)
 
@@ -51,6 +57,7 @@ def _run(args: argparse.Namespace) -> int:
         overrides=_overrides(args.set),
         mapping=_overrides(args.map),
         rate=args.rate,
+        reading=_reading(args),
     )
     summary = run(request)
     _print(summary.values, args.json, summary.text())
@@ -58,9 +65,18 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from sf_bringup.runner import explain
+    from sf_bringup.runner import RunRequest, explain
 
-    value, text = explain(tuple(args.input), args.goal, args.calibration, args.poses, _overrides(args.map))
+    value, text = explain(
+        RunRequest(
+            inputs=tuple(args.input),
+            goal=args.goal,
+            calibration=args.calibration,
+            poses=args.poses,
+            mapping=_overrides(args.map),
+            reading=_reading(args),
+        )
+    )
     _print(value, args.json, text)
     return 0
 
@@ -68,8 +84,18 @@ def _plan(args: argparse.Namespace) -> int:
 def _convert(args: argparse.Namespace) -> int:
     from sf_bringup.inputs import convert
 
-    summary = convert(args.dataset, args.out)
-    _print({"out": str(args.out), "topics": summary}, args.json, f"wrote {args.out}: {summary}")
+    written, counts = convert(args.dataset, args.out, _reading(args))
+    value = {
+        "out": str(args.out),
+        "dataset": written.dataset,
+        "frames": written.frames,
+        "skipped": written.skipped,
+        "reasons": written.reasons,
+        "notes": list(written.notes),
+        "topics": counts,
+    }
+    topics = ", ".join(f"{count} {name}" for name, count in counts.items())
+    _print(value, args.json, "\n".join([*written.sentences(), f"wrote {args.out}: {topics}"]))
     return 0
 
 
@@ -160,10 +186,27 @@ def _report(args: argparse.Namespace) -> int:
     return 0
 
 
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    """How a data set is read."""
+    parser.add_argument("--skip-bad", action="store_true", help="leave out frames whose files are bad, and count them")
+    parser.add_argument("--use-poses", action="store_true", help="its poses are input, not only a reference")
+    parser.add_argument("--depth-scale", type=float, metavar="N", help="stored depth units in a metre, if not its own")
+
+
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("out", type=Path)
+    _add_reading(parser)
+
+
 def _add_input(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "input", nargs="+", type=Path, help="bag (.mcap, .db3, .bag, rosbag2 folder) or data set folder"
+        "input",
+        nargs="+",
+        type=Path,
+        help="bag (.mcap, .db3, .bag, rosbag2 folder), data set folder, folder of photos, or video",
     )
+    _add_reading(parser)
     parser.add_argument("--goal", choices=GOALS, default="auto")
     parser.add_argument("--calibration", type=Path, help="camera.yaml in ROS camera_info format")
     parser.add_argument("--poses", type=Path, help="given poses, TUM format, T_map_camera")
@@ -202,9 +245,7 @@ def build_parser() -> argparse.ArgumentParser:
     for name, (_, help) in PASSED_ON.items():
         verbs.add_parser(name, help=help, add_help=False)
 
-    p = verb("convert", _convert, "write a data set as an mcap bag")
-    p.add_argument("dataset", type=Path)
-    p.add_argument("out", type=Path)
+    _add_convert(verb("convert", _convert, "write a data set as an mcap bag"))
 
     p = verb("simulate", _simulate, "write a bag with exact ground truth from a procedural scene")
     from sf_bringup.simulate_command import add_arguments

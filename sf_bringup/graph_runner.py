@@ -120,8 +120,7 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
             graph.stop()
             _finish_recording(recorder)
         finally:
-            graph.stop()
-            stop_all(helpers, interrupt_s=2.0)
+            stop_all([*graph.processes, *helpers])  # at once: each may take its whole patience
     for sentence in watch.errors:
         print(f"sf: {sentence}", file=sys.stderr)
     return {}

@@ -145,6 +145,7 @@ def test_finished_runs_are_exported_rendered_and_measured(
 
 
 def refused(capsys: pytest.CaptureFixture[str], *args: str) -> str:
+    capsys.readouterr()  # what earlier runs said, such as the progress of a slow one
     assert cli.main(list(args)) == 2
     said = capsys.readouterr().err.strip()
     assert said.startswith("sf") and "Traceback" not in said
