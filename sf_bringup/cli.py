@@ -67,6 +67,7 @@ def _run(args: argparse.Namespace) -> int:
         config=args.config,
         overrides=_overrides(args.set),
         mapping=_overrides(args.map),
+        use=tuple(args.use),
         rate=args.rate,
         reading=_reading(args),
     )
@@ -85,6 +86,7 @@ def _plan(args: argparse.Namespace) -> int:
             calibration=args.calibration,
             poses=args.poses,
             mapping=_overrides(args.map),
+            use=tuple(args.use),
             reading=_reading(args),
         )
     )
@@ -234,6 +236,7 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
         metavar="ROLE=TOPIC",
         help="take this topic as rgb, depth, lidar or pose",
     )
+    parser.add_argument("--use", action="append", default=[], metavar="BLOCK", help="prefer this block (sf blocks)")
 
 
 def _add_export(p: argparse.ArgumentParser) -> None:

@@ -21,7 +21,7 @@ from sf_bringup.progress import Progress
 from sf_bringup.result_writer import ResultWriter
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import sync_values
-from sf_interfaces.blocks import BlockSpec, Quantity
+from sf_interfaces.blocks import BlockSpec, Quantity, load_blocks
 from sf_interfaces.config import ConfigFile, build
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.io.bag import BagReader
@@ -62,20 +62,22 @@ class ProductionLine:
 
     def __init__(self, blocks: Sequence[str], config: ConfigFile, writer: ResultWriter, *, posed: bool) -> None:
         parts = {block: make_part(block, config) for block in blocks}
-        self._flexion = parts.get("flexion")
-        self.tracker = parts.get("tracking")
+        owner = {quantity: s.id for s in load_blocks() if s.id in parts for quantity in s.provides}
+        self._flexion = parts.get(owner.get(Quantity.IMAGE, ""))
+        self._tracker_id = owner.get(Quantity.POSE, "")
+        self.tracker = parts.get(self._tracker_id)
         self._completer = parts.get("depth:complete")
         self.reconstruction = parts.get("recon")
         self._writer, self._config, self._epoch = writer, config, 0
         self.timings = Timings()
-        writer.posed = "tracking" in blocks or posed
+        writer.posed = self.tracker is not None or posed
         self.keyframe_poses: list[tuple[int, Float64]] = []
 
     def in_epoch(self, epoch: int) -> None:
         """A backward jump of time ends one sequence and begins another: the tracker starts anew."""
         if self.tracker is not None and epoch != self._epoch:
             self._finish_keyframes(self.tracker.finish().keyframes)
-            self.tracker = make_part("tracking", self._config)
+            self.tracker = make_part(self._tracker_id, self._config)
         self._epoch = epoch
 
     def step(self, frame: Frame) -> Float64 | None:

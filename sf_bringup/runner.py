@@ -54,6 +54,7 @@ class RunRequest:
     config: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     mapping: Mapping[str, str] = field(default_factory=dict)
+    use: tuple[str, ...] = ()
     rate: float = 0.0
     reading: ReadOptions = field(default_factory=ReadOptions)
 
@@ -99,7 +100,7 @@ def prepare(request: RunRequest) -> tuple[BagInput, inputs.Resolved]:
 def _planned(request: RunRequest, given: BagInput, source: inputs.Resolved) -> Plan:
     """The line for the user's goal, or without one for the goal that suits the input."""
     goal = source.goal if request.goal == "auto" else request.goal
-    return plan(given.mapping.available, goal, load_blocks())
+    return plan(given.mapping.available, goal, load_blocks(), request.use)
 
 
 def _extrinsic(request: RunRequest, found: BagInput) -> tuple[str, str, Float64] | None:

@@ -110,6 +110,8 @@ class ReconNode(BlockNode):
         if self._camera is None and not self._resumed:
             self.health.error("nothing was reconstructed: no keyframe with depth arrived")
             return
+        if self.out is not None and not self.options.lossless:
+            self._save(self.out)  # whoever stops a live line may not wait for the last training
         with self._lock:
             self._reconstruction.finish()
             surface = self._reconstruction.surface()
