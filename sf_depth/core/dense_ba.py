@@ -64,6 +64,7 @@ class Adjusted:
         sigma: deviation of one coordinate of a correspondence, px.
         covariance: of poses (translation, rotation; 6 per source, if free) and free intrinsics phi, [P, P].
         inverse_depth_variance: [N], with what poses and intrinsics contribute; inf where nothing was seen.
+        common_variance: the part of it that comes from poses and intrinsics, [N].
         cost: mean robust cost of an observation, px^2.
     """
 
@@ -72,6 +73,7 @@ class Adjusted:
     sigma: float
     covariance: Float64
     inverse_depth_variance: Float64
+    common_variance: Float64
     cost: float
 
 
@@ -186,7 +188,7 @@ def _linearise(
         b = np.where(blind, 0.0, r[j]) * root
         A[..., blind], a[..., blind] = 0.0, 0.0
         rows = np.r_[6 * j : 6 * j + 6, own:P] if poses else np.arange(own, P)
-        flat = A.reshape(len(rows), -1)
+        flat = A.reshape(len(rows), 2 * N)
         H[np.ix_(rows, rows)] += flat @ flat.T
         g[rows] += flat @ b.ravel()
         E[rows] += A[:, 0] * a[0] + A[:, 1] * a[1]
@@ -269,9 +271,10 @@ def _with_covariance(
             gauge[6 * j : 6 * j + 3] = T[:3, 3]
         S += np.trace(S) * np.outer(gauge, gauge) / max(gauge @ gauge, 1e-300)
     covariance = sigma**2 * np.linalg.pinv(S, hermitian=True) if len(S) else np.zeros((0, 0))
+    common = np.einsum("pn,pn->n", scaled, covariance @ scaled)
     with np.errstate(divide="ignore"):
-        variance = sigma**2 / system.C + np.einsum("pn,pn->n", scaled, covariance @ scaled)
-    return Adjusted(at, iterations, sigma, covariance, variance, _cost(r, seen.weight, sigma))
+        variance = sigma**2 / system.C + common
+    return Adjusted(at, iterations, sigma, covariance, variance, common, _cost(r, seen.weight, sigma))
 
 
 def rescaled(at: Estimate, factor: float) -> Estimate:
