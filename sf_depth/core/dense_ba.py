@@ -78,7 +78,7 @@ class Adjusted:
 
 
 @dataclass(frozen=True, slots=True)
-class _System:
+class System:
     """Normal equations: H [P, P] and g [P] of poses and intrinsics, C [N] and w [N] of depths, E [P, N] between."""
 
     H: Float64
@@ -99,17 +99,17 @@ def adjust(
         iterations: at most.
     """
     here, damping, done = start, 1e-3, 0
-    r = _residuals(seen, here)
+    r = residuals(seen, here)
     while done < iterations:
         sigma = _deviation(r, seen.weight)
         cost = _cost(r, seen.weight, sigma)
         columns = pinhole.free_columns(here.theta, intrinsics)
-        system = _linearise(seen, here, _robust(r, seen.weight, sigma), r, poses, columns)
+        system = linearise(seen, here, _robust(r, seen.weight, sigma), r, poses, columns)
         better = None
         while better is None and done < iterations:
             done += 1
-            there = _moved(here, _step(system, damping), poses, columns)
-            r_there = _residuals(seen, there)
+            there = moved(here, step(system, damping), poses, columns)
+            r_there = residuals(seen, there)
             new = _cost(r_there, seen.weight, sigma)
             if new < cost:
                 better, fall = there, (cost - new) / cost
@@ -126,7 +126,7 @@ def adjust(
     return _with_covariance(seen, here, r, done, poses, intrinsics)
 
 
-def _residuals(seen: Observations, at: Estimate) -> Float64:
+def residuals(seen: Observations, at: Estimate) -> Float64:
     """x* - Pi(G Pi^-1(x, d)), [S, 2, N] px; NaN where a source cannot see the point."""
     x = pinhole.rays(at.theta, seen.uv)
     out = np.empty_like(seen.target)
@@ -168,9 +168,9 @@ def _cost(r: Float64, weight: Float64, sigma: float) -> float:
     return float((weight * c2 * np.log1p(squares / c2)).sum() / max(weight.sum(), 1e-12))
 
 
-def _linearise(
+def linearise(
     seen: Observations, at: Estimate, weight: Float64, r: Float64, poses: bool, columns: Float64
-) -> _System:
+) -> System:
     """Normal equations at an estimate, weights [S, N] and residuals [S, 2, N] given."""
     count, K = len(at.T), columns.shape[1]
     own = 6 * count if poses else 0
@@ -180,7 +180,7 @@ def _linearise(
     x = pinhole.rays(at.theta, seen.uv)
     dx = pinhole.rays_jacobian(at.theta, x, columns) if K else np.zeros((2, 0, N))
     for j, T in enumerate(at.T):
-        A, a = _jacobians(at.theta, T, x, dx, at.inverse_depth, poses, columns)
+        A, a = jacobians(at.theta, T, x, dx, at.inverse_depth, poses, columns)
         root = np.sqrt(weight[j])
         blind = weight[j] == 0
         A *= root
@@ -194,10 +194,10 @@ def _linearise(
         E[rows] += A[:, 0] * a[0] + A[:, 1] * a[1]
         C += a[0] ** 2 + a[1] ** 2
         w += a[0] * b[0] + a[1] * b[1]
-    return _System(H, g, E, C, w)
+    return System(H, g, E, C, w)
 
 
-def _jacobians(
+def jacobians(
     theta: Float64, T: Float64, x: Float64, dx: Float64, d: Float64, poses: bool, columns: Float64
 ) -> tuple[Float64, Float64]:
     """d Pi / d (pose, phi) [6 + K, 2, N] and d Pi / d d [2, N] of one source."""
@@ -230,7 +230,7 @@ def _jacobians(
     return A, np.stack(through((np.full_like(d, t[0]), np.full_like(d, t[1]), np.full_like(d, t[2]))))
 
 
-def _step(system: _System, damping: float) -> tuple[Float64, Float64]:
+def step(system: System, damping: float) -> tuple[Float64, Float64]:
     """Damped step (dx [P], dd [N]); damping is relative to each diagonal, so it scales with the residuals."""
     C = system.C * (1.0 + damping) + _least_information(system.C)
     scaled = system.E / C
@@ -245,7 +245,7 @@ def _least_information(C: Float64) -> float:
     return 1e-6 * float(np.median(C)) + 1e-300
 
 
-def _moved(at: Estimate, step: tuple[Float64, Float64], poses: bool, columns: Float64) -> Estimate:
+def moved(at: Estimate, step: tuple[Float64, Float64], poses: bool, columns: Float64) -> Estimate:
     """The estimate after a step; inverse depths stay positive."""
     dx, dd = step
     count = len(at.T)
@@ -261,7 +261,7 @@ def _with_covariance(
     """Posterior covariance at the optimum. The scale, which nothing observes, counts as known."""
     sigma = _deviation(r, seen.weight)
     columns = pinhole.free_columns(at.theta, intrinsics)
-    system = _linearise(seen, at, _robust(r, seen.weight, sigma), r, poses, columns)
+    system = linearise(seen, at, _robust(r, seen.weight, sigma), r, poses, columns)
     C = system.C + _least_information(system.C)
     scaled = system.E / C
     S = system.H - scaled @ system.E.T

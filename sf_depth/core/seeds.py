@@ -86,8 +86,10 @@ def _verified(matches: Matches, gate: float) -> Matches:
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
     move = matches.second - matches.first
     _, near = cKDTree(matches.first).query(matches.first, k=min(9, len(matches)))
-    off = np.linalg.norm(move - np.median(move[near[:, 1:]], axis=1), axis=1)
-    spread = np.median(np.linalg.norm(move[near[:, 1:]] - np.median(move[near[:, 1:]], axis=1)[:, None], axis=2), axis=1)
+    around = move[near[:, 1:]]  # [N, 8, 2]
+    middle = np.median(around, axis=1)
+    off = np.linalg.norm(move - middle, axis=1)
+    spread = np.median(np.linalg.norm(around - middle[:, None], axis=2), axis=1)
     alike = off < 5.0 * gate + 4.0 * spread
     return Matches(matches.first[alike], matches.second[alike])
 
