@@ -1,4 +1,4 @@
-"""Intrinsics from the first images of a sequence (mode ``calibrate``): uncalibrated U2-MVD, of which only theta is kept."""
+"""Intrinsics from the first images of a sequence (mode ``calibrate``): theta of an uncalibrated U2-MVD."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 
 from sf_depth.config import DepthConfig
+from sf_depth.core.matching import grey
 from sf_depth.core.mvd import MultiViewDepth, Recovered
-from sf_depth.core.overlap import grey
 from sf_depth.core.seeds import Features, detect, match_features
 from sf_interfaces.errors import InsufficientParallax
 from sf_interfaces.types import Camera, UInt8

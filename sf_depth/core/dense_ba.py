@@ -168,9 +168,7 @@ def _cost(r: Float64, weight: Float64, sigma: float) -> float:
     return float((weight * c2 * np.log1p(squares / c2)).sum() / max(weight.sum(), 1e-12))
 
 
-def linearise(
-    seen: Observations, at: Estimate, weight: Float64, r: Float64, poses: bool, columns: Float64
-) -> System:
+def linearise(seen: Observations, at: Estimate, weight: Float64, r: Float64, poses: bool, columns: Float64) -> System:
     """Normal equations at an estimate, weights [S, N] and residuals [S, 2, N] given."""
     count, K = len(at.T), columns.shape[1]
     own = 6 * count if poses else 0

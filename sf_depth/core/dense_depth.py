@@ -46,7 +46,7 @@ def solve(at: Estimate, target: Float32, weight: Float32, sigma: float) -> Inver
     robust = [w for *_, w in parts]
     for _ in range(_ROUNDS):
         top, bottom = np.full_like(d, 1e-30), np.full_like(d, 1e-30)
-        for (a, b, m2, t2, w), r in zip(parts, robust):
+        for (a, b, m2, t2, _), r in zip(parts, robust):
             scale = focal / np.maximum(m2 + t2 * d, _MIN_Z)
             information = r * scale**2
             top += information * (a * b).sum(axis=0)
@@ -72,7 +72,9 @@ def _equations(theta: Float64, T: Float64, x: Float32, target: Float32, weight: 
     return a, b, m[2], t[2], w
 
 
-def _result(d: Float32, parts: list, robust: list, focal: np.float32, sigma: float, shape: tuple[int, int]) -> InverseDepth:
+def _result(
+    d: Float32, parts: list, robust: list, focal: np.float32, sigma: float, shape: tuple[int, int]
+) -> InverseDepth:
     """Keep what a source explains; the variance grows where the sources disagree."""
     gate2 = np.float32((_GATE * shape[1] / 640) ** 2)
     C, misfit, support = np.zeros_like(d), np.zeros_like(d), np.zeros_like(d)

@@ -79,14 +79,14 @@ class FlowMatcher:
 
     def __call__(self, reference: UInt8, source: UInt8, guess: Float32 | None = None) -> Correspondence:
         """Match by a warp of the source onto the reference, so that both directions share one frame."""
-        first, second = _grey(reference), _grey(source)
+        first, second = grey(reference), grey(source)
         if guess is None:
             guess = seed_flow(first.shape, match_features(self._detect(reference, first), self._detect(source, second)))
         grid = pixel_grid(first.shape)
         if guess is None:
             guess = grid
         warped = sample(second, guess)
-        forward, backward = _flow(first, warped), _flow(warped, first)
+        forward, backward = flow(first, warped), flow(warped, first)
         inside = grid + forward  # in the warped source
         target = sample(guess, inside)
         back = inside + sample(backward, inside)
@@ -120,11 +120,11 @@ def sample(image: np.ndarray, at: Float32) -> np.ndarray:
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
-def _grey(image: UInt8) -> UInt8:
+def grey(image: UInt8) -> UInt8:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def _flow(first: UInt8, second: UInt8) -> Float32:
+def flow(first: UInt8, second: UInt8) -> Float32:
     """Displacement [H, W, 2] px from the first image to the second."""
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     return np.asarray(search.calc(first, second, None), dtype=np.float32)

@@ -18,7 +18,7 @@ import numpy as np
 from sf_depth.config import DepthConfig
 from sf_depth.core import checks, dense_ba, dense_depth, pinhole
 from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
-from sf_depth.core.matching import Correspondence, Matcher, load_matcher, pixel_grid
+from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
 from sf_depth.core.outliers import lonely
 from sf_depth.core.scale import from_translations
 from sf_depth.core.start import Size, start, triangulate
@@ -104,17 +104,15 @@ class MultiViewDepth:
             InsufficientParallax: the views do not constrain depth.
         """
         check_images([reference, *sources])
+        T = T_source_reference
         size = Size(reference.shape[1], reference.shape[0])
         theta = None if camera is None else pinhole.theta_of(camera)
-        posed = theta is not None and T_source_reference is not None
         free = self._config.intrinsics if camera is None else "none"
 
         matched = self._match(reference, sources)
-        if posed:
-            at = _triangulated(matched.seen, theta, T_source_reference)  # type: ignore[arg-type]
-        else:
-            at = start(matched.seen, size, theta)
-        fit = self._check_and_adjust(matched.seen, at, size, not posed, free)
+        posed = theta is not None and T is not None
+        at = _triangulated(matched.seen, theta, T) if theta is not None and T is not None else None
+        fit = self._check_and_adjust(matched.seen, at or start(matched.seen, size, theta), size, not posed, free)
         for _ in range(self._config.rematches):
             matched = self._match(reference, sources, _expected(fit, matched.grid, size))
             at = fit.adjusted.estimate

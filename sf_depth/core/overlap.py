@@ -3,22 +3,17 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from sf_depth.core import pinhole
+from sf_depth.core.matching import grey
 from sf_depth.core.seeds import detect, match_features
 from sf_depth.core.start import linear_inverse_depth
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Keyframe, UInt8
+from sf_interfaces.types import Keyframe
 
 _LEAST = 20  # matches with parallax
 _PARALLAX = np.radians(1.0)
-
-
-def grey(image: UInt8) -> UInt8:
-    """The brightness of an RGB or mono image."""
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
 def sighted_depth(frame: Keyframe, others: list[Keyframe]) -> float | None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
+from sf_depth.core.matching import grey
 from sf_depth.core.mvd import MultiViewDepth, Recovered, check_images
 from sf_depth.core.scale import from_translations
 from sf_depth.core.seeds import Features, detect, match_features
@@ -117,7 +118,7 @@ def _resized(camera: Camera, image: UInt8) -> Camera:
 
 def _overlaps(images: list[UInt8]) -> Float64:
     """How well two images triangulate each other, [N, N]: verified matches, fewer where they hardly move."""
-    features: list[Features] = [detect(i if i.ndim == 2 else cv2.cvtColor(i, cv2.COLOR_RGB2GRAY)) for i in images]
+    features: list[Features] = [detect(grey(image)) for image in images]
     out = np.zeros((len(images), len(images)))
     for i in range(len(images)):
         for j in range(i):
@@ -251,4 +252,3 @@ class _Work:
 
     def _count(self, reason: str) -> None:
         self._reasons[reason] = self._reasons.get(reason, 0) + 1
-
