@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 
 from sf_bringup import inputs, preflight
+from sf_bringup.calibration import calibrated
 from sf_bringup.planner import Plan, plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.run_folder import RunFolder, unpack
@@ -151,7 +152,8 @@ def run(request: RunRequest) -> Summary:
     folder = RunFolder(request.out)
     _write_facts(folder, request, given, source, made, config)
     started = time.monotonic()
-    dropped = _engine(request.engine)(folder, given, made, config, request.rate)
+    given, rest = calibrated(given, made, config, request.out)
+    dropped = _engine(request.engine)(folder, given, rest, config, request.rate)
     facts = folder.info() | {"seconds": time.monotonic() - started, "dropped": dropped}
     (folder.path / "run.json").write_text(json.dumps(facts, indent=2))
     unpack(folder)
