@@ -19,6 +19,10 @@
 
 namespace nb = nanobind;
 
+#ifdef SF_CUDA
+void bind_cuda(nb::module_& m);
+#endif
+
 namespace {
 
 using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
@@ -290,4 +294,7 @@ NB_MODULE(_native, m) {
           nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"),
           nb::arg("normals") = nb::none(), nb::arg("position") = true, nb::arg("index") = false,
           nb::arg("weight") = false, nb::arg("normal") = false, nb::arg("threads") = 0);
+#ifdef SF_CUDA
+    bind_cuda(m);
+#endif
 }

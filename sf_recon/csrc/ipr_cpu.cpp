@@ -182,17 +182,18 @@ SF_SIMD void resolve_row(const RasterSpec& spec, int left, int row, int v, TileS
 
 // Mean of the points' normals, each turned towards the camera.
 void blend_normals(const RasterSpec& s, const float* normals, const Fragment* fragments, const TileScratch& t,
-                   int pixel, const float* position, float* out) {
+                   int pixel, float* out) {
     const float* R = s.rotation;
     float sum[3] = {0.0f, 0.0f, 0.0f}, total = 0.0f;
     for (int c = 0; c < t.count[pixel]; ++c) {
-        const float* n = normals + 3 * static_cast<size_t>(fragments[t.list[c * kPixels + pixel]].id);
+        const Fragment& f = fragments[t.list[c * kPixels + pixel]];
+        const float* n = normals + 3 * static_cast<size_t>(f.id);
         const float weight = t.weight[c * kTile + pixel % kTile];
         total += weight;
         float m[3];
         for (int a = 0; a < 3; ++a) m[a] = R[3 * a] * n[0] + R[3 * a + 1] * n[1] + R[3 * a + 2] * n[2];
-        const float towards = m[0] * position[0] + m[1] * position[1] + m[2] * position[2] > 0.0f ? -1.0f : 1.0f;
-        for (int a = 0; a < 3; ++a) sum[a] += towards * weight * m[a];
+        const float along = m[0] * (f.u - s.cx) / s.fx + m[1] * (f.v - s.cy) / s.fy + m[2];
+        for (int a = 0; a < 3; ++a) sum[a] += (along > 0.0f ? -weight : weight) * m[a];
     }
     const float norm = norm_of(sum);
     for (int a = 0; a < 3; ++a) out[a] = norm > 1e-6f * total && total > 0.0f ? sum[a] / norm : kHole;
@@ -214,10 +215,8 @@ void write_row(const RasterSpec& s, const float* normals, const Fragment* fragme
         for (size_t c = 0; c < k && out.weight; ++c)
             out.weight[(at + i) * k + c] = c < count ? t.weight[c * kTile + i] * means.weight[i] : 0.0f;
     }
-    for (int i = 0; i < width && out.normal && normals; ++i) {
-        const float position[3] = {means.x[i], means.y[i], means.z[i]};
-        blend_normals(s, normals, fragments, t, row * kTile + i, position, out.normal + 3 * (at + i));
-    }
+    for (int i = 0; i < width && out.normal && normals; ++i)
+        blend_normals(s, normals, fragments, t, row * kTile + i, out.normal + 3 * (at + i));
 }
 
 void draw_tile(const RasterSpec& s, const float* normals, const Bins& bins, int tile, TileScratch& t,
