@@ -25,7 +25,6 @@ from numpy.typing import NDArray
 
 from sf_interfaces.types import Camera, Float32, Float64
 
-
 MIN_STEP = 1e-5  # of the depth; pixels that show the same point differ by rounding only
 MIN_SINE = 1e-2  # of the angle between two differences that span a surface
 
