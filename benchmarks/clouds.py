@@ -44,12 +44,13 @@ def in_space_order(points: np.ndarray, cell: float = 0.1) -> np.ndarray:
     return points[np.lexsort(np.floor(points / cell).T)]
 
 
-def median_ms(call: Callable[[], object], repeats: int) -> float:
-    """Median wall time after two calls that pay for memory and compilation."""
-    call(), call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - start)
-    return 1e3 * float(np.median(times))
+def median_ms(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
+    """Median wall times, the calls taking turns, so that a busy machine slows all alike."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for turn in range(repeats + 2):  # the first two pay for memory and compilation
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            if turn >= 2:
+                times[name].append(time.perf_counter() - start)
+    return {name: 1e3 * float(np.median(seconds)) for name, seconds in times.items()}

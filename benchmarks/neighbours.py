@@ -14,7 +14,10 @@ import argparse
 import importlib.util
 import json
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import clouds
 import numpy as np
@@ -25,45 +28,51 @@ from sf_recon.core.native import native
 K, RADIUS, QUERIES, INSERTED = 8, 0.02, 100_000, 10_000
 
 
-def timed_ms(call: object) -> tuple[float, object]:
+def timed_ms(call: Callable[[], Any]) -> tuple[float, Any]:
     """Wall time of one call and its result."""
     start = time.perf_counter()
-    result = call()  # type: ignore[operator]
+    result = call()
     return 1e3 * (time.perf_counter() - start), result
 
 
-def measure_grid(points: np.ndarray, more: np.ndarray, queries: np.ndarray) -> dict[str, float]:
-    """Build, insertion and search of the compiled grid; checks that the neighbours are the nearest ones."""
+def filled_grid(points: np.ndarray) -> Any:
+    """The compiled grid with these points."""
+    grid = native().PointGrid(RADIUS)
+    grid.add(points)
+    return grid
 
-    def build() -> object:
-        grid = native().PointGrid(RADIUS)
-        grid.add(points)
-        return grid
 
-    build_ms, grid = timed_ms(build)
-    d2 = grid.knn(queries, K, RADIUS)[1]  # type: ignore[attr-defined]
+def check(grid: Any, points: np.ndarray, queries: np.ndarray) -> None:
+    """The neighbours within the radius are the nearest ones, by scipy."""
+    d2 = grid.knn(queries, K, RADIUS)[1]
     expected = cKDTree(points).query(queries, K, distance_upper_bound=RADIUS, workers=-1)[0]
     both = np.isfinite(d2) & np.isfinite(expected)
     assert np.abs(np.sqrt(d2[both]) - expected[both]).max() < 1e-6, "a neighbour is not the nearest"
     assert (np.isfinite(d2) != np.isfinite(expected)).mean() < 1e-6, "a neighbour within the radius is missing"
-    query_ms = clouds.median_ms(lambda: grid.knn(queries, K, RADIUS), 7)  # type: ignore[attr-defined]
-    parts = np.array_split(more, len(more) // INSERTED)
-    insert_ms = [timed_ms(lambda part=part: grid.add(part))[0] for part in parts]  # type: ignore[attr-defined, misc]
-    return {"build": build_ms, "insert": float(np.median(insert_ms)), "insert_max": max(insert_ms), "query": query_ms}
 
 
-def measure_trees(points: np.ndarray, queries: np.ndarray) -> dict[str, dict[str, float]]:
-    """Build and search of kd-trees; inserting is building again."""
-    rows = {}
-    build_ms, tree = timed_ms(lambda: cKDTree(points))
-    search = lambda: tree.query(queries, K, distance_upper_bound=RADIUS, workers=-1)  # type: ignore[attr-defined] # noqa: E731
-    rows["scipy cKDTree"] = {"build": build_ms, "insert": build_ms, "query": clouds.median_ms(search, 3)}
+def measure(points: np.ndarray, more: np.ndarray, queries: np.ndarray) -> dict[str, dict[str, float]]:
+    """Build, insertion and search in ms; to insert into a kd-tree is to build it again."""
+    builds: dict[str, Callable[[], Any]] = {"grid": lambda: filled_grid(points), "scipy": lambda: cKDTree(points)}
     if importlib.util.find_spec("pykdtree"):
         from pykdtree.kdtree import KDTree
 
-        build_ms, fast = timed_ms(lambda: KDTree(points))
-        query_ms = clouds.median_ms(lambda: fast.query(queries, K, distance_upper_bound=RADIUS), 3)  # type: ignore[attr-defined]
-        rows["pykdtree"] = {"build": build_ms, "insert": build_ms, "query": query_ms}
+        builds["pykdtree"] = lambda: KDTree(points)
+    build_ms, found = {}, {}
+    for name, build in builds.items():
+        build_ms[name], found[name] = timed_ms(build)
+    check(found["grid"], points, queries)
+    searches: dict[str, Callable[[], Any]] = {
+        "grid": lambda: found["grid"].knn(queries, K, RADIUS),
+        "scipy": lambda: found["scipy"].query(queries, K, distance_upper_bound=RADIUS, workers=-1),
+    }
+    if "pykdtree" in found:
+        searches["pykdtree"] = lambda: found["pykdtree"].query(queries, K, distance_upper_bound=RADIUS)
+    query_ms = clouds.median_ms(searches, 5)
+    parts = np.array_split(more, len(more) // INSERTED)
+    insert_ms = [timed_ms(partial(found["grid"].add, part))[0] for part in parts]
+    rows = {name: {"build": build_ms[name], "insert": build_ms[name], "query": query_ms[name]} for name in builds}
+    rows["grid"] |= {"insert": float(np.median(insert_ms)), "insert_max": max(insert_ms)}
     return rows
 
 
@@ -77,7 +86,7 @@ def main() -> None:
     cloud = clouds.fused(args.data, total)[0] if args.data else clouds.walls(total)
     points, queries, more = np.split(cloud, [args.points, args.points + QUERIES])
     queries = queries + np.random.default_rng(1).normal(0, 0.005, queries.shape).astype(np.float32)
-    rows = {"grid": measure_grid(points, more, queries)} | measure_trees(points, queries)
+    rows = measure(points, more, queries)
     for name, row in rows.items():
         print(f"{name:14}" + "".join(f"  {what} {ms:8.2f} ms" for what, ms in row.items()))
     args.out.write_text(json.dumps({"points": args.points, "queries": QUERIES, "k": K, "ms": rows}, indent=1) + "\n")

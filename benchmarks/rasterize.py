@@ -100,7 +100,7 @@ def measure(points: np.ndarray, camera: Camera, T: np.ndarray, threads: int, rep
         draw, T32 = numba_top_k(), T.astype(np.float32)
         view = (camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
         calls["numba top-8"] = lambda: draw(points, T32, *map(np.float32, view[:4]), *view[4:], 1.5, 8, threads)
-    return {name: clouds.median_ms(call, repeats) for name, call in calls.items()}
+    return clouds.median_ms(calls, repeats)
 
 
 def main() -> None:
