@@ -91,6 +91,7 @@ SF_INLINE void draw(const Item& item, int k, float gap, TileScratch& t) {
     const uint64_t columns = (item.window & 0xffff) * 0x0001000100010001ull;
     const int y0 = item.window >> 16 & 255, y1 = item.window >> 24;
     const float z = item.z();
+    uint32_t* list = t.list.data();
     for (int word = y0 / 4; word <= y1 / 4; ++word) {
         const int first = std::max(y0 - 4 * word, 0), last = std::min(y1 - 4 * word, 3);
         const uint64_t rows = (~0ull << (16 * first)) & (~0ull >> (16 * (3 - last)));
@@ -98,7 +99,7 @@ SF_INLINE void draw(const Item& item, int k, float gap, TileScratch& t) {
         for (uint64_t bits = t.open[word] & columns & rows; bits; bits &= bits - 1) {
             const int bit = __builtin_ctzll(bits), p = 64 * word + bit, count = t.count[p];
             const int taken = z - t.last_z[p] < gap;
-            t.list[static_cast<size_t>(count * kPixels + p)] = item.local;
+            list[count * kPixels + p] = item.local;
             t.count[p] = count + taken;
             t.last_z[p] = z;
             complete |= static_cast<uint64_t>(!taken | (count + 1 >= k)) << bit;

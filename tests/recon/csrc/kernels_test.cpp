@@ -119,7 +119,7 @@ void tables() {
     expect(sf::accumulate_rows(ids.data(), ones, 1, 2, out.data(), 3, sums.data(), marks.data(), 100, touched), "sums");
     steps[99] = 1e6f;
     sf::adam_rows(touched, 3, {0.01f, 0.9f, 0.99f, 1e-15f}, sums.data(), values.data(), mean.data(), square.data(),
-                  steps.data());
+                  steps.data(), 2);
     expect(sf::voxel_means(table.data(), 100, 3, 0.5f).size() % 3 == 0, "means");
     try {
         sf::voxel_means(&kNan, 0, 3, 0.5f);
