@@ -45,12 +45,16 @@ def in_space_order(points: np.ndarray, cell: float = 0.1) -> np.ndarray:
 
 
 def median_ms(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, float]:
-    """Median wall times, the calls taking turns, so that a busy machine slows all alike."""
+    """Median wall times over two rounds, so that a busy moment does not hit one method alone.
+
+    Within a round each call repeats by itself: threads of another library may still spin when it has returned.
+    """
     times: dict[str, list[float]] = {name: [] for name in calls}
-    for turn in range(repeats + 2):  # the first two pay for memory and compilation
+    for _ in range(2):
         for name, call in calls.items():
-            start = time.perf_counter()
-            call()
-            if turn >= 2:
-                times[name].append(time.perf_counter() - start)
+            for turn in range(repeats + 3):  # the first three pay for memory, compilation and what still spins
+                start = time.perf_counter()
+                call()
+                if turn >= 3:
+                    times[name].append(time.perf_counter() - start)
     return {name: 1e3 * float(np.median(seconds)) for name, seconds in times.items()}
