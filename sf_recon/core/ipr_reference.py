@@ -100,7 +100,7 @@ def rasterize_reference(
         weight[row, column, : len(first)] = w
         if normals is not None:
             own = normals[visible.ids[first]] @ T[:3, :3].T
-            normal[row, column] = _mean_normal(own, w, position[row, column])
+            normal[row, column] = _mean_normal(own, w, visible.xyz[first])
     if normals is None:
         normal = normals_of(position, options.layer_gap)
     images = {"position": position, "index": index, "weight": weight, "normal": normal}
@@ -133,9 +133,9 @@ def _cover(visible: _Projected, camera: Camera) -> dict[tuple[int, int], list[tu
     return lists
 
 
-def _mean_normal(own: Float32, weights: Float64, position: Float32) -> Float32:
-    """Weighted mean [3] of normals [M, 3] (camera frame), each turned towards the camera; NaN where they cancel."""
-    own = np.where((own @ position)[:, None] > 0, -own, own)
+def _mean_normal(own: Float32, weights: Float64, xyz: Float32) -> Float32:
+    """Weighted mean [3] of the normals [M, 3] of points [M, 3], each turned towards the camera; NaN if they cancel."""
+    own = np.where((own * xyz).sum(axis=1, keepdims=True) > 0, -own, own)
     mean = weights @ own
     norm = np.linalg.norm(mean)
     return (mean / norm if norm > 1e-6 else np.full(3, np.nan)).astype(np.float32)

@@ -156,6 +156,7 @@ class AdamRows:
         rate: float,
         betas: tuple[float, float] = (0.9, 0.99),
         epsilon: float = 1e-15,
+        threads: int = 0,
     ) -> None:
         """Move the rows of ``table`` [M, C] that were interpolated with ids and weights [N, K].
 
@@ -175,4 +176,5 @@ class AdamRows:
             rate,
             *betas,
             epsilon,
+            threads,
         )

@@ -19,6 +19,10 @@
 
 namespace nb = nanobind;
 
+#ifdef SF_CUDA
+void bind_cuda(nb::module_& m);
+#endif
+
 namespace {
 
 using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
@@ -119,14 +123,15 @@ Out<int64_t> accumulate_rows(Ids ids, Rows weights, Rows gradient, MutableRows s
 }
 
 void adam_rows(Ids ids, Rows weights, Rows gradient, MutableRows table, MutableRows mean, MutableRows square,
-               Steps steps, MutableRows sums, Marks marks, float rate, float beta1, float beta2, float epsilon) {
+               Steps steps, MutableRows sums, Marks marks, float rate, float beta1, float beta2, float epsilon,
+               int threads) {
     for (const MutableRows& other : {table, mean, square})
         if (other.shape(0) != sums.shape(0) || other.shape(1) != sums.shape(1))
             throw nb::value_error("adam_rows: table, moments and sums differ in shape");
     if (steps.shape(0) != sums.shape(0)) throw nb::value_error("adam_rows: steps and sums differ in length");
     const std::vector<int64_t> touched = accumulate(ids, weights, gradient, sums, marks);
     sf::adam_rows(touched, sums.shape(1), {rate, beta1, beta2, epsilon}, sums.data(), table.data(), mean.data(),
-                  square.data(), steps.data());
+                  square.data(), steps.data(), threads);
 }
 
 // A network of Python arrays, checked and kept alive.
@@ -278,7 +283,7 @@ NB_MODULE(_native, m) {
     m.def("adam_rows", &adam_rows, nb::arg("ids"), nb::arg("weights"), nb::arg("gradient"),
           nb::arg("table").noconvert(), nb::arg("mean").noconvert(), nb::arg("square").noconvert(),
           nb::arg("steps").noconvert(), nb::arg("sums").noconvert(), nb::arg("marks").noconvert(), nb::arg("rate"),
-          nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
+          nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("threads") = 0);
     m.def("decode_colors", &decode_colors, nb::arg("queries"), nb::arg("levels"), nb::arg("layers"),
           nb::arg("neighbours"), nb::arg("eye") = nb::none(), nb::arg("degree") = 0, nb::arg("base") = nb::none(),
           nb::arg("extra") = nb::none(), nb::arg("threads") = 0);
@@ -290,4 +295,7 @@ NB_MODULE(_native, m) {
           nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"),
           nb::arg("normals") = nb::none(), nb::arg("position") = true, nb::arg("index") = false,
           nb::arg("weight") = false, nb::arg("normal") = false, nb::arg("threads") = 0);
+#ifdef SF_CUDA
+    bind_cuda(m);
+#endif
 }

@@ -18,22 +18,12 @@ struct Projected {  // pixels of the window, inclusive; empty for a point that i
 
 SF_SIMD void project_block(const RasterSpec& spec, const float* points, size_t n, Projected& out) {
     const RasterSpec s = spec;  // a local copy: the compiler need not fear that `out` overlaps it
-    const float* R = s.rotation;
-    const float mx = s.max_half + 1.0f;  // reject before any conversion to int can overflow
-    const float right = static_cast<float>(s.width) + mx, bottom = static_cast<float>(s.height) + mx;
     for (size_t i = 0; i < n; ++i) {
-        const float x = points[3 * i], y = points[3 * i + 1], z = points[3 * i + 2];
-        const float cz = R[6] * x + R[7] * y + R[8] * z + s.translation[2];
-        const float u = s.fx * (R[0] * x + R[1] * y + R[2] * z + s.translation[0]) / cz + s.cx;
-        const float v = s.fy * (R[3] * x + R[4] * y + R[5] * z + s.translation[1]) / cz + s.cy;
-        const bool inside = (cz >= s.near) & (cz < kInfinity) & (u > -mx) & (u < right) & (v > -mx) & (v < bottom);
-        const float su = inside ? u : -mx, sv = inside ? v : -mx, sz = inside ? cz : 1.0f;
-        const float hx = half_width(s, s.fx, sz), hy = half_width(s, s.fy, sz);
-        const int x0 = first_pixel(su, hx, 0), x1 = last_pixel(su, hx, s.width - 1);
-        const int y0 = first_pixel(sv, hy, 0), y1 = last_pixel(sv, hy, s.height - 1);
-        out.u[i] = u, out.v[i] = v, out.z[i] = cz;
-        out.x0[i] = x0, out.x1[i] = x1, out.y0[i] = y0, out.y1[i] = y1;
-        out.visible[i] = inside & (x0 <= x1) & (y0 <= y1);
+        Window w;
+        float u, v, z;
+        out.visible[i] = sf::project(s, points + 3 * i, u, v, z, w);
+        out.u[i] = u, out.v[i] = v, out.z[i] = z;
+        out.x0[i] = w.x0, out.x1[i] = w.x1, out.y0[i] = w.y0, out.y1[i] = w.y1;
     }
 }
 

@@ -6,12 +6,10 @@
 #include <memory>
 #include <vector>
 
-#include "ipr_cpu.hpp"
+#include "ipr_window.hpp"
 #include "simd.hpp"
 
 namespace sf {
-
-constexpr int kTile = 16;  // px
 
 struct Fragment {  // a visible point: continuous pixel, depth, row in the cloud
     float u, v, z;
@@ -24,26 +22,6 @@ struct Bins {
     std::vector<size_t> begin;  // [tiles + 1]
     int tiles_x = 0, tiles_y = 0;
 };
-
-SF_INLINE float half_width(const RasterSpec& s, float focal, float z) {
-    const float half = s.radius * focal / z;
-    const float wide = half > 0.5f ? half : 0.5f;
-    return wide < s.max_half ? wide : s.max_half;
-}
-
-// Pixels whose centre lies within `half` of `centre`, clipped to low..high; empty when first > last. The argument must
-// be of a size that fits an int. No call to floor: baseline x86-64 has no instruction for it.
-SF_INLINE int first_pixel(float centre, float half, int low) {
-    const float edge = centre - half - 0.5f;
-    const int cut = static_cast<int>(edge), first = cut + (static_cast<float>(cut) < edge);
-    return first > low ? first : low;
-}
-
-SF_INLINE int last_pixel(float centre, float half, int high) {
-    const float edge = centre + half - 0.5f;
-    const int cut = static_cast<int>(edge), last = cut - (static_cast<float>(cut) > edge);
-    return last < high ? last : high;
-}
 
 // Memory that a thread keeps from frame to frame.
 class Binner {

@@ -13,7 +13,6 @@ namespace {
 
 constexpr int kPixels = kTile * kTile, kBuckets = 256;
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
-constexpr int32_t kClosed = static_cast<int32_t>(0xff800000u);  // bits of -inf
 constexpr float kHole = std::numeric_limits<float>::quiet_NaN();
 
 constexpr float kMinStep = 1e-5f;  // of the depth; pixels that show the same point differ by rounding only
@@ -23,7 +22,7 @@ inline float norm_of(const float* v) { return std::sqrt(v[0] * v[0] + v[1] * v[1
 
 struct Item {  // a fragment to be sorted
     uint64_t key;     // bits of the depth (positive floats sort like their bits) above the row in the cloud
-    uint32_t window;  // x0 | x1 << 8 | y0 << 16 | y1 << 24, pixels of the tile
+    uint32_t window;  // columns of the tile, one bit each | first row << 16 | last row << 24
     uint32_t local;   // number among the fragments of the tile
 
     bool operator<(const Item& o) const { return key < o.key; }
@@ -37,7 +36,8 @@ struct TileScratch {
     std::vector<uint32_t> list;  // [k_ray + 1, pixels] local numbers, front to back; the last row takes what is too much
     std::vector<float> weight;   // [k_ray, kTile] of one row of pixels
     int32_t count[kPixels];
-    int32_t last_z[kPixels];  // bits of the last point's depth; inf before the first, -inf once the layer is closed
+    float last_z[kPixels];      // depth of the last point; inf before the first
+    uint64_t open[kPixels / 64];  // one bit for each pixel whose list is not complete
 
     void reserve(size_t n) {
         if (windows.size() >= n) return;
@@ -59,7 +59,7 @@ SF_INLINE void unpack(const RasterSpec& spec, const Fragment* fragments, size_t 
         splats[4 * i + 3] = -1.0f / (s.sigma * hx * hx);
         const int x0 = first_pixel(u, hx, left) - left, x1 = last_pixel(u, hx, right) - left;
         const int y0 = first_pixel(v, hy, top) - top, y1 = last_pixel(v, hy, bottom) - top;
-        windows[i] = static_cast<uint32_t>(x0 | x1 << 8 | y0 << 16 | y1 << 24);
+        windows[i] = static_cast<uint32_t>((2 << x1) - (1 << x0) + (y0 << 16) + (y1 << 24));
     }
 }
 
@@ -86,24 +86,26 @@ SF_INLINE int bucket_by_depth(const Fragment* fragments, size_t n, TileScratch& 
     return buckets;
 }
 
-// One fragment into the lists of the pixels it covers; returns how many of them it closes. Free of branches.
-SF_INLINE int draw(const Item& item, int k, float gap, TileScratch& t) {
-    const int x0 = item.window & 255, x1 = item.window >> 8 & 255;
+// One fragment into the lists of the pixels it covers that are still open. A word of 64 bits holds four rows.
+SF_INLINE void draw(const Item& item, int k, float gap, TileScratch& t) {
+    const uint64_t columns = (item.window & 0xffff) * 0x0001000100010001ull;
     const int y0 = item.window >> 16 & 255, y1 = item.window >> 24;
     const float z = item.z();
-    const int32_t bits = to_bits(z);
-    int closed = 0;
-    for (int j = y0; j <= y1; ++j)
-        for (int p = j * kTile + x0; p <= j * kTile + x1; ++p) {
-            const int32_t last = t.last_z[p], count = t.count[p];
-            const int32_t taken = z - from_bits(last) < gap;
-            const int32_t open = taken & (count + 1 < k), mask = -open;
-            t.list[static_cast<size_t>(count * kPixels + p)] = item.local;
+    uint32_t* list = t.list.data();
+    for (int word = y0 / 4; word <= y1 / 4; ++word) {
+        const int first = std::max(y0 - 4 * word, 0), last = std::min(y1 - 4 * word, 3);
+        const uint64_t rows = (~0ull << (16 * first)) & (~0ull >> (16 * (3 - last)));
+        uint64_t complete = 0;
+        for (uint64_t bits = t.open[word] & columns & rows; bits; bits &= bits - 1) {
+            const int bit = __builtin_ctzll(bits), p = 64 * word + bit, count = t.count[p];
+            const int taken = z - t.last_z[p] < gap;
+            list[count * kPixels + p] = item.local;
             t.count[p] = count + taken;
-            t.last_z[p] = (bits & mask) | (kClosed & ~mask);
-            closed += (last != kClosed) & ~open;
+            t.last_z[p] = z;
+            complete |= static_cast<uint64_t>(!taken | (count + 1 >= k)) << bit;
         }
-    return closed;
+        t.open[word] &= ~complete;
+    }
 }
 
 void insertion_sort(Item* first, Item* last) {
@@ -117,20 +119,24 @@ void insertion_sort(Item* first, Item* last) {
 
 SF_SIMD void fill_lists(const RasterSpec& s, const Fragment* fragments, size_t n, int left, int top, TileScratch& t) {
     std::fill(t.count, t.count + kPixels, 0);
-    std::fill(t.last_z, t.last_z + kPixels, to_bits(kInfinity));
+    std::fill(t.last_z, t.last_z + kPixels, kInfinity);
+    const uint64_t columns = (2ull << (std::min(kTile, s.width - left) - 1)) - 1;
+    for (int row = 0; row < kTile; ++row) {
+        const uint64_t open = row < s.height - top ? columns : 0;
+        t.open[row / 4] = row % 4 ? t.open[row / 4] | open << (16 * (row % 4)) : open;
+    }
     if (n == 0) return;
     t.reserve(n);
     unpack(s, fragments, n, left, top, t);
     uint32_t begin[kBuckets + 2];
     const int buckets = bucket_by_depth(fragments, n, t, begin);
-    int open = std::min(kTile, s.width - left) * std::min(kTile, s.height - top);
-    for (int b = 0; b < buckets && open > 0; ++b) {
+    for (int b = 0; b < buckets && (t.open[0] | t.open[1] | t.open[2] | t.open[3]); ++b) {
         Item *first = t.items.data() + begin[b], *last = t.items.data() + begin[b + 1];
         if (last - first > 24)
             std::sort(first, last);
         else if (last - first > 1)
             insertion_sort(first, last);
-        for (; first < last && open > 0; ++first) open -= draw(*first, s.k_ray, s.layer_gap, t);
+        for (; first < last; ++first) draw(*first, s.k_ray, s.layer_gap, t);
     }
 }
 
@@ -182,17 +188,18 @@ SF_SIMD void resolve_row(const RasterSpec& spec, int left, int row, int v, TileS
 
 // Mean of the points' normals, each turned towards the camera.
 void blend_normals(const RasterSpec& s, const float* normals, const Fragment* fragments, const TileScratch& t,
-                   int pixel, const float* position, float* out) {
+                   int pixel, float* out) {
     const float* R = s.rotation;
     float sum[3] = {0.0f, 0.0f, 0.0f}, total = 0.0f;
     for (int c = 0; c < t.count[pixel]; ++c) {
-        const float* n = normals + 3 * static_cast<size_t>(fragments[t.list[c * kPixels + pixel]].id);
+        const Fragment& f = fragments[t.list[c * kPixels + pixel]];
+        const float* n = normals + 3 * static_cast<size_t>(f.id);
         const float weight = t.weight[c * kTile + pixel % kTile];
         total += weight;
         float m[3];
         for (int a = 0; a < 3; ++a) m[a] = R[3 * a] * n[0] + R[3 * a + 1] * n[1] + R[3 * a + 2] * n[2];
-        const float towards = m[0] * position[0] + m[1] * position[1] + m[2] * position[2] > 0.0f ? -1.0f : 1.0f;
-        for (int a = 0; a < 3; ++a) sum[a] += towards * weight * m[a];
+        const float along = m[0] * (f.u - s.cx) / s.fx + m[1] * (f.v - s.cy) / s.fy + m[2];
+        for (int a = 0; a < 3; ++a) sum[a] += (along > 0.0f ? -weight : weight) * m[a];
     }
     const float norm = norm_of(sum);
     for (int a = 0; a < 3; ++a) out[a] = norm > 1e-6f * total && total > 0.0f ? sum[a] / norm : kHole;
@@ -214,10 +221,8 @@ void write_row(const RasterSpec& s, const float* normals, const Fragment* fragme
         for (size_t c = 0; c < k && out.weight; ++c)
             out.weight[(at + i) * k + c] = c < count ? t.weight[c * kTile + i] * means.weight[i] : 0.0f;
     }
-    for (int i = 0; i < width && out.normal && normals; ++i) {
-        const float position[3] = {means.x[i], means.y[i], means.z[i]};
-        blend_normals(s, normals, fragments, t, row * kTile + i, position, out.normal + 3 * (at + i));
-    }
+    for (int i = 0; i < width && out.normal && normals; ++i)
+        blend_normals(s, normals, fragments, t, row * kTile + i, out.normal + 3 * (at + i));
 }
 
 void draw_tile(const RasterSpec& s, const float* normals, const Bins& bins, int tile, TileScratch& t,

@@ -14,6 +14,8 @@ namespace sf {
 namespace {
 
 constexpr size_t kChunk = 512;
+constexpr size_t kAhead = 12;  // rows lie anywhere in memory: ask for them this many before they are needed
+constexpr size_t kMaxStep = 4096;  // from then on the bias corrections are 1
 
 // sum += weight * row; columns that are a multiple of 8 go 8 at a time.
 SF_INLINE void add_scaled(float* sum, const float* row, float weight, size_t columns) {
@@ -41,6 +43,10 @@ SF_SIMD bool interpolate_chunk(const float* table, size_t rows, size_t columns, 
 SF_SIMD bool accumulate(const int32_t* ids, const float* weights, size_t n, size_t k, const float* gradient,
                         size_t columns, float* sums, uint8_t* marks, size_t rows, std::vector<int64_t>& touched) {
     for (size_t i = 0; i < n * k; ++i) {
+        if (i + kAhead < n * k && static_cast<size_t>(ids[i + kAhead]) < rows) {
+            __builtin_prefetch(sums + static_cast<size_t>(ids[i + kAhead]) * columns, 1);
+            __builtin_prefetch(marks + ids[i + kAhead], 1);
+        }
         if (weights[i] == 0.0f) continue;  // no neighbour there
         const size_t row = static_cast<size_t>(ids[i]);
         if (row >= rows) return false;
@@ -84,18 +90,23 @@ bool accumulate_rows(const int32_t* ids, const float* weights, size_t n, size_t 
 }
 
 void adam_rows(const std::vector<int64_t>& touched, size_t columns, const AdamRates& a, float* sums, float* table,
-               float* mean, float* square, float* steps) {
-    std::vector<std::pair<float, float>> corrections;  // by the number of steps: most rows share few numbers
-    for (const int64_t row : touched) {
-        const size_t step = static_cast<size_t>(steps[row] += 1.0f);
-        while (corrections.size() <= std::min<size_t>(step, 4096)) {
-            const double t = static_cast<double>(corrections.size());
-            corrections.emplace_back(static_cast<float>(a.rate / (1 - std::pow(a.beta1, t))),
-                                     static_cast<float>(1 / (1 - std::pow(a.beta2, t))));
+               float* mean, float* square, float* steps, int threads) {
+    std::vector<std::pair<float, float>> corrections(kMaxStep + 1);  // of the step and of the square, by step number
+    double power1 = 1, power2 = 1;
+    for (size_t t = 1; t <= kMaxStep; ++t) {
+        power1 *= a.beta1, power2 *= a.beta2;
+        corrections[t] = {static_cast<float>(a.rate / (1 - power1)), static_cast<float>(1 / (1 - power2))};
+    }
+#pragma omp parallel for num_threads(threads > 0 ? threads : omp_get_max_threads())
+    for (size_t i = 0; i < touched.size(); ++i) {
+        if (i + kAhead < touched.size()) {
+            const size_t next = static_cast<size_t>(touched[i + kAhead]);
+            for (float* values : {sums, table, mean, square}) __builtin_prefetch(values + next * columns, 1);
+            __builtin_prefetch(steps + next, 1);
         }
-        const auto [rate, scale] = corrections[std::min<size_t>(step, 4096)];
-        const size_t at = static_cast<size_t>(row) * columns;
-        adam_row(columns, rate, scale, a, sums + at, table + at, mean + at, square + at);
+        const size_t row = static_cast<size_t>(touched[i]), at = row * columns;
+        const auto [step, scale] = corrections[std::min(static_cast<size_t>(steps[row] += 1.0f), kMaxStep)];
+        adam_row(columns, step, scale, a, sums + at, table + at, mean + at, square + at);
     }
 }
 

@@ -24,7 +24,7 @@ struct AdamRates {
 // One step of Adam on the touched rows of a table by their gradient in `sums`, which is then 0 again. Each row counts
 // its own steps. table, mean, square, sums [rows, columns]; steps [rows].
 void adam_rows(const std::vector<int64_t>& touched, size_t columns, const AdamRates& rates, float* sums, float* table,
-               float* mean, float* square, float* steps);
+               float* mean, float* square, float* steps, int threads);
 
 // Mean of the rows [n, columns] that fall in each cell of a grid (columns 0-2 are the position), in order of first
 // appearance. Throws std::out_of_range for a position that is not finite or too far away.

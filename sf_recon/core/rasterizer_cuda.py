@@ -1,0 +1,68 @@
+"""The rasteriser on an NVIDIA GPU, for tensors that live there. Needs a build with ``-DSF_CUDA=ON``."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sf_interfaces.errors import ConfigError
+from sf_interfaces.types import Camera, Float64
+from sf_recon.core.ipr_reference import RasterOptions
+from sf_recon.core.native import native
+
+HOW_TO_BUILD = "build it with the CUDA toolkit: pip install . -Ccmake.define.SF_CUDA=ON"
+
+
+class CudaRasterizer:
+    """Draws points of one device; keeps the memory it needs from frame to frame.
+
+    Raises:
+        ConfigError: the kernels were built without CUDA.
+    """
+
+    def __init__(self, device: int = 0) -> None:
+        module = native()
+        if not hasattr(module, "CudaRasterizer"):
+            raise ConfigError(f"the compiled kernels have no CUDA rasteriser; {HOW_TO_BUILD}")
+        self._device = torch.device("cuda", device)
+        self._kernel: Any = module.CudaRasterizer(device)
+
+    def rasterize(
+        self,
+        points: Tensor,
+        camera: Camera,
+        T_camera_map: Float64,
+        options: RasterOptions,
+        *,
+        outputs: Collection[str] = ("position",),
+        normals: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """Draw float32 points [N, 3] (map frame) of the device.
+
+        Returns:
+            ``depth`` and the wanted images, shaped as in :class:`~sf_recon.core.ipr_reference.Raster`, queued
+            on the current stream.
+        """
+        pixels = (camera.height, camera.width)
+        shapes = {"depth": pixels, "position": (*pixels, 3), "normal": (*pixels, 3)}
+        shapes |= dict.fromkeys(("index", "weight"), (*pixels, options.k_ray))
+        images = {
+            name: torch.empty(shape, dtype=torch.int32 if name == "index" else torch.float32, device=self._device)
+            for name, shape in shapes.items()
+            if name == "depth" or name in outputs
+        }
+        self._kernel.rasterize(
+            points.contiguous(),
+            np.ascontiguousarray(T_camera_map, dtype=np.float32),
+            *(camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height),
+            *(options.radius, options.near, options.max_half, options.k_ray, options.layer_gap, options.sigma),
+            None if normals is None else normals.contiguous(),
+            *(images.get(name) for name in ("depth", "position", "index", "weight", "normal")),
+            torch.cuda.current_stream(self._device).cuda_stream,
+        )
+        return images
