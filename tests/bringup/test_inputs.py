@@ -125,6 +125,9 @@ def test_plan_reads_only_the_first_frames(tmp_path: Path, capsys: pytest.Capture
     assert "40." in capsys.readouterr().err and not list(tmp_path.glob("*.mcap"))
     assert main(["convert", str(folder), str(tmp_path / "o.mcap"), "--skip-bad", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
+    assert main(["convert", str(folder), str(tmp_path / "o.bag")]) == 2
+    assert main(["convert", str(tmp_path / "o.mcap"), str(tmp_path / "p.mcap")]) == 2
+    assert "must end in .mcap" in (err := capsys.readouterr().err) and "a bag already" in err
     assert (said["frames"], said["skipped"]) == (5, 1) and "40." in said["reasons"][0]
 
 
