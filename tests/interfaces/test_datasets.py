@@ -86,6 +86,11 @@ def test_poses_are_an_input_only_on_request(layout: Layout, tmp_path: Path) -> N
     assert bag.topics[GIVEN].count == bag.topics[TRUTH].count == 1
 
 
+def test_poses_that_are_not_there_cannot_be_used(tmp_path: Path) -> None:
+    with pytest.raises(FormatError, match="comes without poses"):
+        convert(layouts.kitti_stereo(tmp_path / "set", 2), tmp_path / "out.mcap", use_poses=True)
+
+
 @pytest.mark.parametrize("layout", [one for one in LAYOUTS if one.image], ids=by_make)
 @pytest.mark.parametrize("damage", ["truncated", "missing"])
 def test_a_bad_image_is_named_or_left_out(layout: Layout, damage: str, tmp_path: Path) -> None:

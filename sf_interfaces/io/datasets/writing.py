@@ -43,11 +43,12 @@ class ReadOptions:
 
 @dataclass(slots=True)
 class Written:
-    """What became of a data set: frames written and skipped, why (the first ones), notes, and what it is for."""
+    """What became of a data set: what it is for, frames written, with a pose and skipped, why (the first ones), notes."""
 
     dataset: str
     goal: str = "auto"
     frames: int = 0
+    posed: int = 0
     skipped: int = 0
     reasons: list[str] = field(default_factory=list)
     notes: tuple[str, ...] = ()
@@ -125,6 +126,7 @@ def write(
             _write_fixed(writer, dataset, sample.stamp_ns, options.limit)
         _write_sample(writer, sample, dataset.depth_encoding, options.use_poses)
         done.frames += 1
+        done.posed += sample.pose is not None
         if progress is not None:
             progress(done.frames + done.skipped, total)
         if done.frames == options.limit:
@@ -132,6 +134,8 @@ def write(
     if not done.frames:
         why = f": {done.reasons[0]}" if done.reasons else "; copy the data set again"
         raise FormatError(f"no frame of {dataset.path} ({dataset.name}) can be used{why}")
+    if options.use_poses and not done.posed:
+        raise FormatError(f"--use-poses: {dataset.path} ({dataset.name}) comes without poses; give some with --poses")
     return done
 
 
