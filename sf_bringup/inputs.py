@@ -67,7 +67,7 @@ def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolv
     written, _ = convert(path, converted, options)
     notes = written.sentences()
     if written.goal != "auto":
-        notes.append(f"{written.dataset}: frames without an order in time, so without --goal they get goal {written.goal}")
+        notes.append(f"{written.dataset}: frames have no order in time; without --goal they get {written.goal}")
     return Resolved(converted, tuple(notes), written.goal)
 
 

@@ -43,7 +43,7 @@ class ReadOptions:
 
 @dataclass(slots=True)
 class Written:
-    """What became of a data set: what it is for, frames written, with a pose and skipped, why (the first ones), notes."""
+    """What became of a data set: its goal, frames written, with a pose, and skipped, why (the first ones), notes."""
 
     dataset: str
     goal: str = "auto"
