@@ -32,6 +32,8 @@ def convert(dataset: Path, out: Path, options: ReadOptions) -> tuple[Written, di
     Raises:
         SceneFactoryError: no such folder, its layout is not known, or a file of it is bad.
     """
+    if out.suffix != ".mcap":
+        raise FormatError(f"cannot write {out}: the bag must end in .mcap")
     recognised = datasets.recognise(dataset, options.depth_scale)
     with _whole(out) as unfinished, SequenceWriter(unfinished) as writer, Progress("reading", "frames") as progress:
         written = datasets.write(recognised, writer, options, progress.update)
@@ -65,7 +67,7 @@ def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolv
     written, _ = convert(path, converted, options)
     notes = written.sentences()
     if written.goal != "auto":
-        notes.append(f"{written.dataset}: frames without an order in time, so they are for goal {written.goal}")
+        notes.append(f"{written.dataset}: frames have no order in time; without --goal they get {written.goal}")
     return Resolved(converted, tuple(notes), written.goal)
 
 

@@ -60,15 +60,28 @@ def calibration(path: Path, model: str, size: tuple[int, int] = SIZE) -> Path:
     return path
 
 
+KINDS = {
+    "/camera/color/image_raw": "image",
+    "/camera/color/camera_info": "camera_info",
+    "/camera/depth/image_raw": "depth",
+    "/lidar/points": "lidar",
+    "/sf/pose": "pose",
+    "/tf_static": "tf_static",
+}
+
+
 def frames(bag: Path) -> list[Frame]:
-    """What a line would get."""
-    inputs = SensorInputs(SyncConfig(), lossless=True)
-    kinds = {"/camera/color/image_raw": "image", "/camera/color/camera_info": "camera_info"}
+    """What a line would get; nothing may be dropped."""
     with BagReader(bag) as reader:
+        kinds = {topic: kind for topic, kind in KINDS.items() if topic in reader.topics}
+        streams = {kind: kind in kinds.values() for kind in ("depth", "lidar", "pose")}
+        inputs = SensorInputs(SyncConfig(**streams), lossless=True)
         for raw in reader.messages(list(kinds)):
             inputs.push(kinds[raw.topic], reader.decode(raw))
     inputs.assembler.end()
-    return list(inputs.assembler.ready())
+    found = list(inputs.assembler.ready())
+    assert inputs.assembler.reasons == {}
+    return found
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -115,6 +128,29 @@ def test_poses_of_a_data_set_and_of_a_bag_become_input_on_request(tmp_path: Path
         assert Quantity.GIVEN_POSE in prepare(posed)[0].mapping.available
 
 
+@pytest.mark.parametrize(
+    ("folder", "count", "posed"),
+    [
+        ("lidarcompletion_kitti2015_a", 4, False),
+        ("mvd_robustmvd_sample", 7, True),
+        ("mvs_strecha_fountain_P11", 11, True),
+        ("rgbd_7scenes_redkitchen_000_199", 5, True),
+        ("rgbl_kitti_odometry04_000_017", 18, True),
+    ],
+)
+def test_every_frame_of_a_real_recording_reaches_a_line(
+    folder: str, count: int, posed: bool, shared_data: Callable[[str], Path], tmp_path: Path
+) -> None:
+    reading = ReadOptions(use_poses=posed, limit=count)
+    given, _ = prepare(RunRequest((shared_data(folder),), out=tmp_path, reading=reading))
+    found = frames(given.bag)
+    assert len(found) == count and all((frame.T_map_camera is not None) == posed for frame in found)
+    depths = [frame.sparse_depth for frame in found] if "lidar" in given.mapping.roles else []
+    assert all(sparse is not None and len(sparse) > 10_000 for sparse in depths)
+    if "depth" in given.mapping.roles:
+        assert all(frame.depth is not None and frame.depth.density > 0.6 for frame in found)
+
+
 def test_plan_reads_only_the_first_frames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = layouts.scannet(tmp_path / "set", 6)
     for name in ("color/40.jpg", "depth/40.png", "pose/40.txt"):
@@ -125,6 +161,9 @@ def test_plan_reads_only_the_first_frames(tmp_path: Path, capsys: pytest.Capture
     assert "40." in capsys.readouterr().err and not list(tmp_path.glob("*.mcap"))
     assert main(["convert", str(folder), str(tmp_path / "o.mcap"), "--skip-bad", "--json"]) == 0
     said = json.loads(capsys.readouterr().out)
+    assert main(["convert", str(folder), str(tmp_path / "o.bag")]) == 2
+    assert main(["convert", str(tmp_path / "o.mcap"), str(tmp_path / "p.mcap")]) == 2
+    assert "must end in .mcap" in (err := capsys.readouterr().err) and "a bag already" in err
     assert (said["frames"], said["skipped"]) == (5, 1) and "40." in said["reasons"][0]
 
 

@@ -64,6 +64,8 @@ def _bags(path: Path) -> list[str]:
 
 def _what_else(path: Path) -> str:
     """Why a path is no data set, and what to give instead."""
+    if is_bag(path):
+        return "is a bag already; there is nothing to convert"
     if path.is_file():
         if path.suffix.lower() in (".txt", ".tum", ".csv", ".kitti"):
             return "is a text file, no recording: a trajectory is given with --poses (input) or --reference (eval)"

@@ -165,7 +165,8 @@ class MvsNet(Dataset):
     def _sample(self, stamp: int, file: Path, cam: Path, depth: Path | None, frames: CameraFrames) -> Sample:
         T, K = read_mvsnet_camera(cam)
         image = read_rgb(file)
-        camera = _camera(K, image.shape[1], image.shape[0], frames(tuple(K.ravel().tolist())))
+        frame = frames((*K.ravel().tolist(), *image.shape))
+        camera = _camera(K, image.shape[1], image.shape[0], frame)
         reference = None if depth is None else as_depth(read_pfm(depth))
         if reference is not None and reference.z.shape != image.shape[:2]:
             raise FormatError(f"depth {depth} is not of the size of {file}; give depth maps of the full images")
@@ -262,7 +263,7 @@ class RobustMvd(Dataset):
         K = _read_npy(view / "K.npy", (3, 3))
         T_view_key = rigid(_read_npy(view / "to_ref_transform.npy", (4, 4)), view / "to_ref_transform.npy")
         image = read_rgb(file)
-        frame = frames(tuple(K.ravel().tolist()))
+        frame = frames((*K.ravel().tolist(), *image.shape))
         camera = _camera(K, image.shape[1], image.shape[0], frame)
         return Sample(stamp, file, image, camera, pose=se3.inverse(T_view_key))
 

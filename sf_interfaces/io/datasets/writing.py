@@ -43,11 +43,12 @@ class ReadOptions:
 
 @dataclass(slots=True)
 class Written:
-    """What became of a data set: frames written and skipped, why (the first ones), notes, and what it is for."""
+    """What became of a data set: its goal, frames written, with a pose, and skipped, why (the first ones), notes."""
 
     dataset: str
     goal: str = "auto"
     frames: int = 0
+    posed: int = 0
     skipped: int = 0
     reasons: list[str] = field(default_factory=list)
     notes: tuple[str, ...] = ()
@@ -62,7 +63,7 @@ class Written:
 
 
 class _Sizes:
-    """Images of one camera have one size, those of one set nearly one."""
+    """Images of one camera have one size, those of one set nearly one; depth and calibration fit the image."""
 
     def __init__(self) -> None:
         self._first: Sample | None = None
@@ -70,30 +71,32 @@ class _Sizes:
 
     def check(self, sample: Sample) -> None:
         """Raise a FormatError that names the image if it does not fit those before."""
-        size = sample.image.shape[:2]
-        first = self._first or sample
-        largest = max(abs(a - b) / b for a, b in zip(size, first.image.shape[:2], strict=True))
-        known = size if sample.camera is None else self._of_camera.get(sample.camera.frame_id, size)
-        if largest > _SIZE_TOLERANCE or known != size:
-            raise FormatError(
-                f"image {sample.file} is {size[1]}x{size[0]} but {first.file.name} is "
-                f"{first.image.shape[1]}x{first.image.shape[0]}; put images of other sizes in a folder of their own"
-            )
+        image, size, camera = sample.file, sample.image.shape[:2], sample.camera
         for depth in (sample.depth, sample.reference_depth):
             if depth is not None and depth.z.shape != size:
                 raise FormatError(
-                    f"depth of image {sample.file} is {depth.z.shape[1]}x{depth.z.shape[0]}, the image {size[1]}x"
-                    f"{size[0]}; register depth to the image first"
+                    f"depth of image {image} is {_wh(depth.z.shape)}, the image {_wh(size)}; register depth to it first"
                 )
-        if sample.camera is not None:
-            camera = sample.camera
-            if (camera.height, camera.width) != size:
-                raise FormatError(
-                    f"image {sample.file} is {size[1]}x{size[0]} but its calibration is for "
-                    f"{camera.width}x{camera.height}; give the images the calibration belongs to"
-                )
-            self._of_camera[camera.frame_id] = size
+        if camera is not None and (camera.height, camera.width) != size:
+            raise FormatError(
+                f"image {image} is {_wh(size)} but its calibration is for {camera.width}x{camera.height}; "
+                "give the images the calibration belongs to"
+            )
+        first = self._first or sample
+        known = size if camera is None else self._of_camera.get(camera.frame_id, size)
+        largest = max(abs(a - b) / b for a, b in zip(size, first.image.shape[:2], strict=True))
+        if known != size or largest > _SIZE_TOLERANCE:
+            raise FormatError(
+                f"image {image} is {_wh(size)} but {first.file.name} is {_wh(first.image.shape)}; "
+                "put images of other sizes in a folder of their own"
+            )
         self._first = first
+        if camera is not None:
+            self._of_camera[camera.frame_id] = size
+
+
+def _wh(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"
 
 
 def write(
@@ -125,6 +128,7 @@ def write(
             _write_fixed(writer, dataset, sample.stamp_ns, options.limit)
         _write_sample(writer, sample, dataset.depth_encoding, options.use_poses)
         done.frames += 1
+        done.posed += sample.pose is not None
         if progress is not None:
             progress(done.frames + done.skipped, total)
         if done.frames == options.limit:
@@ -132,6 +136,8 @@ def write(
     if not done.frames:
         why = f": {done.reasons[0]}" if done.reasons else "; copy the data set again"
         raise FormatError(f"no frame of {dataset.path} ({dataset.name}) can be used{why}")
+    if options.use_poses and not done.posed:
+        raise FormatError(f"--use-poses: {dataset.path} ({dataset.name}) comes without poses; give some with --poses")
     return done
 
 
