@@ -15,7 +15,7 @@ from sf_bringup import measures
 from sf_bringup.simulate import PRESETS
 from sf_interfaces.errors import SceneFactoryError
 
-SENSORS = {"room": "structured_light", "hall": "structured_light", "palace": "none", "campus": "none"}  # else a LiDAR
+SENSORS = {"room": "tof", "hall": "tof", "palace": "none", "campus": "none"}  # else a LiDAR
 
 
 def main() -> None:

@@ -125,10 +125,10 @@ def main() -> None:
     bench.parser.add_argument("--skip-fusion", action="store_true")
     args = bench.parse()
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
-    spec = replace(shrunk(PRESETS[args.scene], args.frames, args.stride, args.factor), depth="structured_light")
+    spec = replace(shrunk(PRESETS[args.scene], args.frames, args.stride, args.factor), depth="tof")
     bag, mesh = simulated(spec, args.out)
     frames = load_frames(bag)
-    bench.note(f"{len(frames)} RGB-D frames of '{args.scene}' at {spec.width}x{spec.height}, structured-light noise.")
+    bench.note(f"{len(frames)} RGB-D frames of '{args.scene}' at {spec.width}x{spec.height}, time-of-flight noise.")
     tables = {"tracking": side_by_side(OurTracker, ODOMETRY, frames, lambda make: measure_tracker(make, frames))}
     if not args.skip_fusion:
         truth = read_surface(mesh)
