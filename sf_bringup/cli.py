@@ -67,6 +67,7 @@ def _run(args: argparse.Namespace) -> int:
         config=args.config,
         overrides=_overrides(args.set),
         mapping=_overrides(args.map),
+        use=tuple(args.use),
         rate=args.rate,
         reading=_reading(args),
     )
@@ -85,6 +86,7 @@ def _plan(args: argparse.Namespace) -> int:
             calibration=args.calibration,
             poses=args.poses,
             mapping=_overrides(args.map),
+            use=tuple(args.use),
             reading=_reading(args),
         )
     )
@@ -158,7 +160,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from sf_bringup.products import render_views
+    from sf_bringup.looking import render_views
 
     count = render_views(args.run, args.poses, args.out)
     _print({"views": count}, args.json, f"wrote {count} views to {args.out}")
@@ -166,9 +168,9 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _view(args: argparse.Namespace) -> int:
-    from sf_bringup.products import view
+    from sf_bringup.looking import view
 
-    view(args.run)
+    view(args.run, args.host, args.port, lambda url: _print({"url": url}, args.json, f"{url}   (Ctrl-C ends)"))
     return 0
 
 
@@ -234,6 +236,7 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
         metavar="ROLE=TOPIC",
         help="take this topic as rgb, depth, lidar or pose",
     )
+    parser.add_argument("--use", action="append", default=[], metavar="BLOCK", help="prefer this block (sf blocks)")
 
 
 def _add_export(p: argparse.ArgumentParser) -> None:
@@ -242,6 +245,12 @@ def _add_export(p: argparse.ArgumentParser) -> None:
     p.add_argument("--frame", choices=("camera", "base_link", "lidar"), default="camera", help="whose trajectory")
     for form, what in _EXPORTS.items():
         p.add_argument(f"--{form}", action="store_true", help=what)
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
+    parser.add_argument("--port", type=int, default=8080)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -288,7 +297,7 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("run", type=Path)
     p.add_argument("--poses", type=Path, required=True, help="T_map_camera in TUM format")
     p.add_argument("--out", type=Path, required=True)
-    verb("view", _view, "show the surface of a finished run").add_argument("run", type=Path)
+    _add_view(verb("view", _view, "serve a page that shows the map of a finished run"))
 
     p = verb("export", _export, "write the results of a run in other formats; without a format: all it has")
     _add_export(p)

@@ -166,8 +166,14 @@ class Line:
             raise SceneFactoryError(f"{why}; see {log}")
         return f"{why}; the line goes on without {', '.join(lost)}; see {log}"
 
-    def stop(self) -> None:
-        """End all nodes; they are gone when this returns, and so is the shared memory of those that were killed."""
+    def stop(self, save_s: float = 0.0) -> None:
+        """End all nodes; they are gone when this returns, and so is the shared memory of those that were killed.
+
+        Args:
+            save_s: how long live nodes may take to write their results; 0: no longer than a moment.
+        """
+        if save_s:
+            stop_all(self.processes, interrupt_s=save_s)
         stop_all(self.processes)
         self._running.clear()
         sweep_shared_memory()

@@ -31,6 +31,7 @@ from sf_interfaces.ros.qos import qos_profile
 HOSTS = "hosts"  # section of the configuration: node -> host that runs it with --only
 _LOOK_S = 0.25  # between two looks at the graph
 _SETTLE_S = 1.0  # topics must have stayed the same this long before the line is planned anew
+_SAVE_S = 60.0  # at the end, for the map and the trajectory to be written
 _GONE_S = 30.0  # an input of the running line may be silent this long (a driver restarts) before the line changes
 
 
@@ -99,8 +100,8 @@ class Orchestrator(Node):
             self.get_logger().warning(sentence)
 
     def stop(self) -> None:
-        """End all nodes."""
-        self._line.stop()
+        """End all nodes, when they have written their results."""
+        self._line.stop(_SAVE_S)
 
     # ---- inside
 

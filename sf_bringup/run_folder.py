@@ -103,7 +103,13 @@ class RunFolder:
                 yield int(path.stem), DepthMap(data["z"], data.get("variance"), self.scale)
 
     def camera(self) -> Camera:
-        """The camera of the run."""
+        """The camera of the run.
+
+        Raises:
+            FormatError: no keyframe was made, so there is none.
+        """
+        if not (self.path / "camera.yaml").is_file():
+            raise FormatError(f"{self.path} has no camera.yaml: the run made no keyframe")
         values = yaml.safe_load((self.path / "camera.yaml").read_text())
         k = values["camera_matrix"]["data"]
         width, height = values["image_width"], values["image_height"]

@@ -75,6 +75,8 @@ def launches(
     """
     plan.check_runnable()
     first = plan.steps[0]
+    if first.spec.id == "depth:mvd":
+        raise PlanError("an image set is estimated at once, in one process: leave --engine ros out")
     if first.spec.name == "depth" and Q.POSE not in plan.available:
         raise PlanError(
             "single frames without poses are completed in one process: leave --engine ros out, or use --goal recon"
@@ -84,12 +86,16 @@ def launches(
 
 
 def _source(step: Step) -> str:
-    """Where a node's frames or keyframes come from: the nearest block upstream, or the sensors."""
-    if step.spec.name == "recon" and step.sources.get(Q.DEPTH, INPUT).startswith("depth"):
+    """Which stream a node takes in: keyframes completed (depth) or tracked, whoever provides them, or the sensors'."""
+    if _provider(step, Q.DEPTH) and Q.DEPTH in step.spec.requires:
         return "depth"
-    if step.spec.name in ("recon", "depth") and step.sources.get(Q.POSE) == "tracking":
-        return "tracking"
-    return "sensors"
+    return "tracking" if _provider(step, Q.POSE) else "sensors"
+
+
+def _provider(step: Step, quantity: Quantity) -> str:
+    """Name of the node upstream that completes a quantity; empty where it is given or not used."""
+    source = step.sources.get(quantity, INPUT)
+    return "" if source == INPUT else source.partition(":")[0]
 
 
 def _launch(
@@ -102,15 +108,19 @@ def _launch(
     compressed: Sequence[str],
 ) -> NodeLaunch:
     source = _source(step)
-    flexion = step.spec.name != "flexion" and source == "sensors" and step.sources.get(Q.IMAGE) == "flexion"
+    made_image = _provider(step, Q.IMAGE) if source == "sensors" else ""
     parameters: dict[str, Any] = {"source": source, "lossless": lossless, "out": out}
     remaps: dict[str, str] = {}
-    if flexion:
-        parameters["upstream"] = "flexion"
+    upstream = made_image or _provider(step, Q.DEPTH if source == "depth" else Q.POSE)
+    if upstream and upstream != source:
+        parameters["upstream"] = upstream
+    if made_image:
         remaps[topics.RGB_IMAGE.name] = topics.FLEXION_IMAGE.name
+    if step.spec.mode:
+        parameters["mode"] = step.spec.mode
     parameters |= dict(config.sections.get(step.spec.name, {}))
     if source == "sensors":
-        carried = [stream for stream in compressed if not (flexion and stream == "image")]
+        carried = [stream for stream in compressed if not (made_image and stream == "image")]
         sync = {**sync_values(plan, roles, step), "compressed": carried, **config.sections.get("sync", {})}
         parameters |= {f"sync.{key}": value for key, value in sync.items()}
         remaps |= {

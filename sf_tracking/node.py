@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from time import monotonic
 from typing import Any, ClassVar
 
 from sf_interfaces import topics
@@ -41,6 +42,7 @@ class TrackingNode(BlockNode):
             self.listen(topic, kind, keep)
         for topic in (topics.TRACKING_POSE, topics.TRACKING_PATH, topics.TF, *TRACKED.values()):
             self.output(topic)
+        self._next_save = 0.0
         self._begin()
         if (snapshot := self.snapshot("tracking.npz")) is not None:
             self._tracker = TrackingSession.restore(self._config, snapshot)
@@ -102,8 +104,16 @@ class TrackingNode(BlockNode):
             publish_bundle(self, keyframe, TRACKED, set(TRACKED))
             self.health.count("keyframes")
             self.sent_one(keyframe.stamp_ns)
-        if update.keyframes and (path := self.state("tracking.npz")) is not None:
-            self._tracker.save(path)
+        if update.keyframes:
+            self._save_state()
+
+    def _save_state(self) -> None:
+        """A snapshot for a successor; a long trajectory is written less often, so that it never costs much."""
+        path, begin = self.state("tracking.npz"), monotonic()
+        if path is None or begin < self._next_save:
+            return
+        self._tracker.save(path)
+        self._next_save = begin + max(1.0, 20 * (monotonic() - begin))
 
     def _publish_path(self, trajectory: Trajectory) -> None:
         if len(trajectory):

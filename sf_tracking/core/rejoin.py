@@ -1,4 +1,4 @@
-"""Where in the map is this image? Answered from final keyframes, their landmarks and descriptors alone."""
+"""Where in the map is this image? Answered from remembered views, their landmarks and descriptors alone."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -7,9 +7,10 @@ from collections.abc import Iterable
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, Float64, Keyframe, UInt8
+from sf_interfaces.types import Camera, Float64, Frame, Keyframe, PointCloud, UInt8
 from sf_tracking.core.patches import to_gray
 
 _FEATURES = 1500
@@ -17,7 +18,32 @@ _PATCH_PX = 31.0  # what a descriptor looks at
 _RATIO = 0.8  # Lowe's ratio between best and second match
 _PNP_PX = 3.0
 _PNP_ROUNDS = 500
-_MIN_INLIERS = 20
+_MIN_INLIERS = 40  # fewer were seen to agree on a pose that is decimetres off
+_MIN_SHARE = 0.4  # of the matches
+_SPARSE_PX = 2.0  # a corner takes the depth of a LiDAR point this near
+
+
+def view(frame: Frame, T_map_camera: Float64) -> Keyframe | None:
+    """A tracked frame as something to find the map by: its corners with measured depth are the landmarks.
+
+    Returns:
+        None where nothing is measured (the final keyframes of the tracker have to do).
+    """
+    assert frame.image is not None and frame.camera is not None
+    corners = cv2.ORB_create(nfeatures=_FEATURES).detect(to_gray(frame.image), None)
+    uv = np.array([k.pt for k in corners]).reshape(-1, 2) + 0.5
+    z = np.full(len(uv), np.nan)
+    if frame.depth is not None and len(uv):
+        column, row = uv.astype(np.int64).T
+        z = np.where(frame.depth.valid, frame.depth.z, np.nan)[row, column].astype(np.float64)
+    elif frame.sparse_depth is not None and len(uv) and len(frame.sparse_depth):
+        distance, nearest = cKDTree(frame.sparse_depth.uv).query(uv, distance_upper_bound=_SPARSE_PX)
+        z[np.isfinite(distance)] = frame.sparse_depth.z[nearest[np.isfinite(distance)]]
+    known = np.isfinite(z)
+    if known.sum() < _MIN_INLIERS:
+        return None
+    points = frame.camera.unproject(uv[known], z[known]).astype(np.float32)
+    return Keyframe(frame.stamp_ns, frame.camera, frame.image, T_map_camera, None, PointCloud(points))
 
 
 def rejoin(keyframes: Iterable[Keyframe], image: UInt8, camera: Camera) -> Float64 | None:
@@ -64,7 +90,7 @@ def _solve(world: Float64, pixels: Float64, camera: Camera) -> Float64 | None:
         world, pixels, camera.K, None,
         iterationsCount=_PNP_ROUNDS, reprojectionError=_PNP_PX, flags=cv2.SOLVEPNP_EPNP,
     )  # fmt: skip
-    if not ok or inliers is None or len(inliers) < _MIN_INLIERS:
+    if not ok or inliers is None or len(inliers) < max(_MIN_INLIERS, _MIN_SHARE * len(world)):
         return None
     chosen = inliers.ravel()
     rvec, tvec = cv2.solvePnPRefineLM(world[chosen], pixels[chosen], camera.K, None, rvec, tvec)

@@ -20,10 +20,11 @@ from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, PointCloud, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.patches import to_gray
-from sf_tracking.core.rejoin import rejoin
+from sf_tracking.core.rejoin import rejoin, view
 from sf_tracking.core.tracker import Tracker, TrackingState, TrackingUpdate
 
-_REMEMBERED = 8  # keyframes to find the map by: enough to cover what a camera saw in its last seconds
+_REMEMBERED = 4  # views of the last seconds, and as many final keyframes, to find the map by
+_VIEW_EVERY_NS = 1_000_000_000
 _PARTS = ("gray", "pose", "points", "camera", "stamp")  # of a remembered keyframe in a snapshot
 
 Poses = dict[int, Float64]  # stamp ns -> T_map_camera
@@ -37,7 +38,8 @@ class TrackingSession:
         self._tracker = Tracker(config)
         self._camera: Camera | None = None
         self._T_map_start: Float64 | None = np.eye(4)  # None: where the new tracker starts is still to be found
-        self._remembered: deque[Keyframe] = deque(maxlen=_REMEMBERED)
+        self._finals: deque[Keyframe] = deque(maxlen=_REMEMBERED)
+        self._views: deque[Keyframe] = deque(maxlen=2 * _REMEMBERED)
         self._poses: Poses = {}  # of trackers that have ended
         self._keyframes: Poses = {}
         self._scale = Scale.METRIC
@@ -54,6 +56,7 @@ class TrackingSession:
             ended = self._succeed()
         self._camera = frame.camera
         update = self._rejoin(frame) if self._T_map_start is None else self._placed(self._tracker.track(frame))
+        self._look(frame, update.T_map_camera)
         return replace(update, keyframes=(*ended, *update.keyframes)) if ended else update
 
     def finish(self) -> TrackingUpdate:
@@ -110,10 +113,17 @@ class TrackingSession:
         """T_map_camera by the remembered keyframes; of a camera that merely changed its lens, the last pose serves."""
         if frame.image is None or frame.camera is None:
             raise FormatError("tracking needs an image and its camera_info in every frame")
-        T = rejoin(self._remembered, frame.image, frame.camera)
+        T = rejoin([*self._views, *self._finals], frame.image, frame.camera)
         if T is not None or self._restored:
             return T
         return self._poses[max(self._poses)]
+
+    def _look(self, frame: Frame, T_map_camera: Float64 | None) -> None:
+        """Remember a tracked frame now and then."""
+        if T_map_camera is None or (self._views and frame.stamp_ns - self._views[-1].stamp_ns < _VIEW_EVERY_NS):
+            return
+        if (seen := view(frame, T_map_camera)) is not None:
+            self._views.append(seen)
 
     def _lost(self, stamp_ns: int) -> TrackingUpdate:
         return TrackingUpdate(stamp_ns, None, TrackingState.LOST, scale=self._scale)
@@ -124,7 +134,7 @@ class TrackingSession:
         assert start is not None
         self._scale = update.scale
         moved = tuple(replace(k, T_map_camera=start @ k.T_map_camera) for k in update.keyframes)
-        self._remembered.extend(moved)
+        self._finals.extend(moved)
         self._keyframes |= {k.stamp_ns: k.T_map_camera for k in moved}
         T = None if update.T_map_camera is None else start @ update.T_map_camera
         return replace(update, keyframes=moved, T_map_camera=T)
@@ -142,7 +152,7 @@ class TrackingSession:
             "keyframe_stamps": keyframes.stamps_ns,
             "keyframe_poses": keyframes.poses,
         }
-        for i, k in enumerate(self._remembered):
+        for i, k in enumerate([*self._finals, *self._views]):
             camera = k.camera
             arrays[f"{i}.gray"] = to_gray(k.image)
             arrays[f"{i}.pose"] = k.T_map_camera
@@ -167,7 +177,7 @@ class TrackingSession:
             out._poses = dict(zip(a["stamps"].tolist(), a["poses"], strict=True))
             out._keyframes = dict(zip(a["keyframe_stamps"].tolist(), a["keyframe_poses"], strict=True))
             for i in range(sum(name.endswith(".gray") for name in a)):
-                out._remembered.append(_keyframe({k: a[f"{i}.{k}"] for k in _PARTS}))
+                out._views.append(_keyframe({k: a[f"{i}.{k}"] for k in _PARTS}))
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
             raise FormatError(f"{path} is no snapshot of the tracker ({error}); delete it and start anew") from error
         out._T_map_start, out._restored = out._start(), True
