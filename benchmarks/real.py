@@ -127,7 +127,7 @@ def small_house(world: Path, frames: int, out: Path) -> list[tuple[str, Path]]:
     """The Gazebo world rendered twice, exact ground truth included."""
     size = {"frames": frames, "fps": 10.0, "width": 320, "height": 240, "focal": 240.0}
     return [
-        ("small house, RGB-D", simulated(SimulationSpec(str(world), depth="structured_light", **size), out)[0]),
+        ("small house, RGB-D", simulated(SimulationSpec(str(world), depth="tof", **size), out)[0]),
         ("small house, RGB-L", simulated(SimulationSpec(str(world), lidar="spinning64", **size), out)[0]),
     ]
 

@@ -16,6 +16,7 @@ import paper
 from common import DEPTH, Benchmark, mean_row, print_rows, run_line, shrunk, simulated, without
 
 from sf_bringup import measures
+from sf_bringup.evaluation.image import Lpips
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.simulate import PRESETS
 from sf_interfaces.errors import SceneFactoryError
@@ -31,13 +32,18 @@ def score(run: RunFolder, mesh: Path) -> dict[str, Any]:
         cells |= {"acc cm": culled.accuracy, "comp cm": culled.completion, "ratio %": culled.completion_ratio}
         cells |= {"comp cm unculled": unculled.completion, "ratio % unculled": unculled.completion_ratio}
         views = measures.measure_render(run)
-        cells |= {"PSNR": views["psnr_full"], "SSIM": views["ssim"], "LPIPS": views["lpips_alex"]}
+        cells |= {"PSNR": views["psnr_full"], "SSIM": views["ssim"], "LPIPS": _number(views["lpips_alex"])}
         cells["PSNR surface"] = views["psnr_surface"]
         if isinstance(views["extrapolated"], dict):
             cells |= {f"{name} off path": views["extrapolated"][key] for name, key in _OFF_PATH.items()}
     except SceneFactoryError as error:
         cells["remark"] = str(error)
     return cells
+
+
+def _number(value: float | str) -> float | str:
+    """A number, or a dash for what the note above the table says is missing."""
+    return value if isinstance(value, float) else "-"
 
 
 _OFF_PATH = {"PSNR": "psnr_full", "SSIM": "ssim", "PSNR surface": "psnr_surface"}
@@ -71,6 +77,10 @@ def main() -> None:
         f"{args.frames} frames, every {args.stride}., at {args.factor} of 1200x680: simulated rooms with exact depth. "
         "Paper rows are for Replica's scans at full length and size on a GPU."
     )
+    try:
+        Lpips.find()
+    except SceneFactoryError as error:
+        bench.note(f"No LPIPS: {error}.")
     rows = []
     for room in args.rooms:
         spec = replace(shrunk(PRESETS[room], args.frames, args.stride, args.factor), depth="exact", novel_views=8)

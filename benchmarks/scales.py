@@ -15,7 +15,7 @@ from sf_bringup import measures
 from sf_bringup.simulate import PRESETS
 from sf_interfaces.errors import SceneFactoryError
 
-SENSORS = {"room": "structured_light", "hall": "structured_light", "palace": "none", "campus": "none"}  # else a LiDAR
+SENSORS = {"room": "tof", "hall": "tof", "palace": "none", "campus": "none"}  # else a LiDAR
 
 
 def main() -> None:
@@ -44,7 +44,7 @@ def main() -> None:
             surface = measures.measure_mesh(run, mesh)["nice_culled"]
             cells |= {"acc cm": surface.accuracy, "comp cm": surface.completion, "F-score 5 cm": surface.f_score}
             cells |= {"PSNR surface": measures.render_scores(measures.render_held_out(run))["psnr_surface"]}
-            cells |= {f"{stage} ms": t["median_ms"] for stage, t in (times or {}).items()}
+            cells |= {f"{stage} ms": t["median_ms"] for stage, t in (times or {}).items() if "median_ms" in t}
         except SceneFactoryError as error:
             cells["remark"] = str(error)
         rows.append({"scene": scene, "sensors": "RGB-L" if spec.lidar != "none" else "RGB-D", **cells})

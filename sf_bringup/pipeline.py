@@ -134,7 +134,9 @@ class ProductionLine:
 
     def _complete(self, keyframe: Keyframe) -> None:
         if self._sequence is not None:
-            self._densified(self._sequence.add(keyframe))
+            with self.timings.measure("depth"):
+                dense = self._sequence.add(keyframe)
+            self._densified(dense)
             return
         if self._completer is not None:
             with self.timings.measure("depth"):

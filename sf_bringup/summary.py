@@ -182,7 +182,9 @@ def run_figures(run: RunFolder) -> dict[str, Figure]:
         if errors is not None:
             out["calibration of the depth variance"] = figures.calibration_figure(*errors)
     if (times := run.timing()) is not None:
-        out["rate and latency"] = figures.timing_figure({name: t["each_ms"] for name, t in times.items()})
+        calls = {name: t["each_ms"] for name, t in times.items() if "each_ms" in t}
+        if calls:
+            out["rate and latency"] = figures.timing_figure(calls)
     return out
 
 

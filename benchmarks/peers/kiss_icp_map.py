@@ -11,6 +11,7 @@ from peers import points_of
 from sf_interfaces.types import Camera, Float64, Frame
 
 RANGE, VOXEL = (0.1, 10.0), 0.05  # m
+THRESHOLD, MOTION = 0.2, 0.01  # m; its defaults, 2 m and 0.1 m, are for cars
 
 
 class KissIcp:
@@ -20,6 +21,7 @@ class KissIcp:
         config = KISSConfig()
         config.data.min_range, config.data.max_range, config.data.deskew = *RANGE, False
         config.mapping.voxel_size = VOXEL
+        config.adaptive_threshold.initial_threshold, config.adaptive_threshold.min_motion_th = THRESHOLD, MOTION
         self._odometry = KissICP(config)
 
     def track(self, frame: Frame) -> Float64 | None:
