@@ -72,18 +72,17 @@ def kernel(
         E1, E2: neighbourhood shapes [B, N, 3], [B, M, 3] px^2 (xx, xy, yy).
         c1, c2: features [B, N, C], [B, M, C].
     """
-    d = x1[:, :, None] - x2[:, None]
-    s = E1[:, :, None] + E2[:, None]
-    det = s[..., 0] * s[..., 2] - s[..., 1] ** 2
-    dx, dy = d[..., 0], d[..., 1]
-    q = 0.5 * (s[..., 2] * dx * dx - 2.0 * s[..., 1] * dx * dy + s[..., 0] * dy * dy) / det
-    r = torch.sqrt(3.0 * q + _JITTER)
-    det1 = (E1[..., 0] * E1[..., 2] - E1[..., 1] ** 2)[:, :, None]
-    det2 = (E2[..., 0] * E2[..., 2] - E2[..., 1] ** 2)[:, None]
-    norm = 2.0 * (det1 * det2) ** 0.25 / torch.sqrt(det)
-    squares = (c1 * c1).sum(dim=2)[:, :, None] + (c2 * c2).sum(dim=2)[:, None]
-    color = (squares - 2.0 * c1 @ c2.transpose(1, 2)).clamp_min(0.0)
-    return norm * (1.0 + r) * torch.exp(-r - 0.5 * color)
+    (px, py), (qx, qy) = (x.unbind(dim=2) for x in (x1, x2))
+    (pxx, pxy, pyy), (qxx, qxy, qyy) = (E.unbind(dim=2) for E in (E1, E2))
+    dx, dy = px[..., None] - qx[:, None], py[..., None] - qy[:, None]
+    xx, xy, yy = pxx[..., None] + qxx[:, None], pxy[..., None] + qxy[:, None], pyy[..., None] + qyy[:, None]
+    det = xx * yy - xy * xy
+    Q = 0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det
+    r = torch.sqrt(3.0 * Q + _JITTER)
+    root = (pxx * pyy - pxy * pxy)[..., None] ** 0.25 * (qxx * qyy - qxy * qxy)[:, None] ** 0.25
+    squares = (c1 * c1).sum(dim=2)[..., None] + (c2 * c2).sum(dim=2)[:, None]
+    color = (squares - 2.0 * c1 @ c2.transpose(1, 2)).clamp_min_(0.0)
+    return 2.0 * root * torch.rsqrt(det) * (1.0 + r) * torch.exp(-r - 0.5 * color)
 
 
 def make_covariance(config: DepthConfig) -> CovarianceModel:
