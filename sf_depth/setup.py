@@ -19,6 +19,10 @@ setup(
     entry_points={
         "scenefactory.blocks": ["depth = sf_depth.block:SPECS"],
         "scenefactory.parts": ["depth:complete = sf_depth.block:make"],
+        "scenefactory.covariance": [
+            "depthcov = sf_depth.core.depthcov:make",
+            "structure = sf_depth.core.covariance:make_structure",
+        ],
         "console_scripts": ["node = sf_depth.node:main"],
     },
 )

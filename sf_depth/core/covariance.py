@@ -7,7 +7,9 @@ no training: correlation shortens across image edges, and colours that differ do
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Protocol
 
 import cv2
@@ -15,8 +17,10 @@ import numpy as np
 import torch
 
 from sf_depth.config import DepthConfig
+from sf_interfaces.errors import ConfigError
 from sf_interfaces.types import UInt8
 
+ENTRY_POINT_GROUP = "scenefactory.covariance"
 _JITTER = 1e-8  # under the root, so that the kernel is smooth at zero distance
 
 
@@ -85,6 +89,19 @@ def kernel(
     return 2.0 * root * torch.rsqrt(det) * (1.0 + r) * torch.exp(-r - 0.5 * color)
 
 
-def make_covariance(config: DepthConfig) -> CovarianceModel:
-    """The covariance that the configuration names."""
+def make_structure(config: DepthConfig) -> CovarianceModel:
+    """Covariance from image structure, which needs no weights."""
     return StructureCovariance(config.covariance_color_scale, config.edge_strength)
+
+
+def make_covariance(config: DepthConfig) -> CovarianceModel:
+    """The covariance that the configuration names, one of entry-point group ``scenefactory.covariance``.
+
+    Raises:
+        ConfigError: no installed package provides it, or its weights are missing.
+    """
+    found = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
+    if config.covariance not in found:
+        raise ConfigError(f"no covariance '{config.covariance}' is installed; choose one of {', '.join(sorted(found))}")
+    make: Callable[[DepthConfig], CovarianceModel] = found[config.covariance].load()
+    return make(config)
