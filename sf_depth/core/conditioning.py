@@ -57,7 +57,7 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
     indices, trees, nears, spacings, first = [], [], [], [], []
     for cell in _CELLS:
         index = np.argwhere(measured & gap) if cell == 1 else _thinned(everywhere, cell)
-        if indices and len(index) < 2 * _NEIGHBOURS:
+        if indices and len(index) <= _NEIGHBOURS:
             break
         if indices and _SPARSER * len(index) > len(indices[-1]) and cell > 1:
             continue

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 from torch import nn
-from torch.nn import functional as F
+from torch.nn import functional
 
 from sf_depth.config import DepthConfig
 from sf_depth.core.covariance import PixelCovariance
@@ -40,8 +40,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """[B, inputs, H, W] -> [B, outputs, H, W]."""
-        y = F.leaky_relu(self.norm(self.conv1(x)), 0.01)
-        return F.leaky_relu(self.norm(self.conv2(y)) + self.shortcut(x), 0.01)
+        y = functional.leaky_relu(self.norm(self.conv1(x)), 0.01)
+        return functional.leaky_relu(self.norm(self.conv2(y)) + self.shortcut(x), 0.01)
 
 
 class UpBlock(nn.Module):
@@ -54,7 +54,7 @@ class UpBlock(nn.Module):
 
     def forward(self, x: torch.Tensor, skip: torch.Tensor) -> torch.Tensor:
         """[B, inputs, H, W] and [B, outputs, 2H, 2W] -> [B, outputs, 2H, 2W]."""
-        x = F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+        x = functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
         return self.mix(torch.cat([self.reduce(x), skip], dim=1))
 
 
@@ -78,7 +78,7 @@ class DepthCovNet(nn.Module):
         mean, std = (image.new_tensor(v)[:, None, None] for v in (_MEAN, _STD))
         x, skips = (image - mean) / std, []
         for number, block in enumerate(self.encoder):
-            x = block(x if number == 0 else F.max_pool2d(x, 2))
+            x = block(x if number == 0 else functional.max_pool2d(x, 2))
             skips.append(x)
         levels = []
         for number, block in enumerate(self.decoder):
@@ -138,7 +138,7 @@ class DepthCov:
         small = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         with torch.no_grad():
             finest = self._net(torch.from_numpy(small).permute(2, 0, 1)[None])[-1]
-            full = F.interpolate(finest, (height, width), mode="bilinear", align_corners=False)[0]
+            full = functional.interpolate(finest, (height, width), mode="bilinear", align_corners=False)[0]
         yy, xy, xx = full
         half_h, half_w = 0.5 * height, 0.5 * width  # normalised coordinates run from -1 to 1
         shape = torch.stack([xx * half_w**2, xy * half_w * half_h, yy * half_h**2], dim=-1)
