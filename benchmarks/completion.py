@@ -17,7 +17,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import cKDTree
 
 from sf_bringup.simulate.simulator import T_CAMERA_LIDAR, Simulator
@@ -29,7 +30,8 @@ from sf_interfaces.types import Camera, DepthMap, Float64, Keyframe, SparseDepth
 
 STEREO_BASE = 721.5377 * 0.5327  # focal length px times baseline m
 Sample = tuple[Keyframe, Float64]  # sparse keyframe, truth [H, W] m (NaN = not scored)
-Method = Callable[[Keyframe], tuple[Float64, Float64 | None]]
+Mask = NDArray[np.bool_]  # [H, W] pixels that are scored
+Method = Callable[[Keyframe, Mask], tuple[Float64, Float64 | None]]  # depth of the scored pixels and sigma
 
 
 def _calibration(path: Path) -> dict[str, Float64]:
@@ -137,37 +139,33 @@ def simulated_holes(seed: int) -> Iterator[Sample]:
         yield _with_holes(simulator.spec.camera, image, simulator.sensor_depth(frame, z), z, frame)
 
 
-def nearest(keyframe: Keyframe) -> tuple[Float64, None]:
+def nearest(keyframe: Keyframe, scored: Mask) -> tuple[Float64, None]:
     """The depth of the nearest measured pixel."""
     points = SparseDepth.from_map(keyframe.depth)
-    return NearestNDInterpolator(points.uv, points.z)(keyframe.camera.pixel_grid()), None
+    return points.z[cKDTree(points.uv).query(keyframe.camera.pixel_grid()[scored])[1]], None
 
 
-def linear(keyframe: Keyframe) -> tuple[Float64, None]:
+def linear(keyframe: Keyframe, scored: Mask) -> tuple[Float64, None]:
     """Linear interpolation on the Delaunay triangulation, nearest outside its hull."""
     points = SparseDepth.from_map(keyframe.depth)
-    z = LinearNDInterpolator(points.uv, points.z)(keyframe.camera.pixel_grid())
-    return np.where(np.isfinite(z), z, nearest(keyframe)[0]), None
+    z = LinearNDInterpolator(points.uv, points.z)(keyframe.camera.pixel_grid()[scored])
+    return np.where(np.isfinite(z), z, nearest(keyframe, scored)[0]), None
 
 
-def bilateral(keyframe: Keyframe) -> tuple[Float64, None]:
+def bilateral(keyframe: Keyframe, scored: Mask) -> tuple[Float64, None]:
     """Joint bilateral filter: the 16 nearest measured pixels, weighted by distance and colour."""
     points = SparseDepth.from_map(keyframe.depth)
-    missing = ~keyframe.depth.valid
-    near, ids = cKDTree(points.uv).query(keyframe.camera.pixel_grid()[missing], k=16, workers=-1)
+    near, ids = cKDTree(points.uv).query(keyframe.camera.pixel_grid()[scored], k=16)
     color = cv2.GaussianBlur(keyframe.image, (0, 0), 0.7).astype(np.float32) / 255.0
-    seen = color[keyframe.depth.valid][ids]
-    off = ((color[missing][:, None] - seen) ** 2).sum(axis=2)
+    off = ((color[scored][:, None] - color[keyframe.depth.valid][ids]) ** 2).sum(axis=2)
     weight = np.exp(-0.5 * (near / near.mean()) ** 2 - 0.5 * off / 0.1**2) + 1e-12
-    z = np.array(keyframe.depth.z, dtype=np.float64)
-    z[missing] = (weight * points.z[ids]).sum(axis=1) / weight.sum(axis=1)
-    return z, None
+    return (weight * points.z[ids]).sum(axis=1) / weight.sum(axis=1), None
 
 
-def scalecov(keyframe: Keyframe) -> tuple[Float64, Float64]:
-    """The depth block."""
+def scalecov(keyframe: Keyframe, scored: Mask) -> tuple[Float64, Float64]:
+    """The depth block; it completes the whole image."""
     depth = DepthCompleter(DepthConfig()).complete(keyframe).depth
-    return depth.z, np.sqrt(depth.variance)
+    return depth.z[scored], np.sqrt(depth.variance[scored])
 
 
 METHODS: dict[str, Method] = {
@@ -182,17 +180,17 @@ def measure(samples: list[Sample], method: Method) -> dict[str, float]:
     """Mean over frames of the errors at scored pixels, shares within 1 and 2 sigma, and median time per frame."""
     rows, seconds = [], []
     for keyframe, truth in samples:
-        start = time.perf_counter()
-        z, sigma = method(keyframe)
-        seconds.append(time.perf_counter() - start)
         scored = np.isfinite(truth)
-        z, truth = z[scored], truth[scored]
+        start = time.perf_counter()
+        z, sigma = method(keyframe, scored)
+        seconds.append(time.perf_counter() - start)
+        truth = truth[scored]
         e = np.abs(z - truth)
         rows.append(
             [e.mean(), np.sqrt((e**2).mean()), (e / truth).mean(), (np.maximum(z / truth, truth / z) < 1.03).mean()]
         )
         if sigma is not None:
-            rows[-1] += [(e < sigma[scored]).mean(), (e < 2 * sigma[scored]).mean()]
+            rows[-1] += [(e < sigma).mean(), (e < 2 * sigma).mean()]
     names = ("mae_m", "rmse_m", "absrel", "inlier_1.03", "within_1_sigma", "within_2_sigma")
     out = {name: float(value) for name, value in zip(names, np.mean(rows, axis=0), strict=False)}
     return out | {"seconds": float(np.median(seconds))}

@@ -20,6 +20,8 @@ class DepthConfig:
     color_scale: float = option(
         0.1, "colour difference (0..1) at which an observation counts half", low=0.01, high=10.0
     )
+    covariance: str = option("structure", "covariance of depth: structure (of the image) or depthcov (a network)")
+    covariance_weights: str = option("", "path of the network's checkpoint")
     covariance_color_scale: float = option(
         0.08, "colour difference (0..1) over which correlation falls to 0.6", low=0.01, high=10.0
     )

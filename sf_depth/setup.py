@@ -25,6 +25,10 @@ setup(
             "depth:posed = sf_depth.block:make_posed",
             "depth:slam = sf_depth.block:make_slam",
         ],
+        "scenefactory.covariance": [
+            "depthcov = sf_depth.core.depthcov:make",
+            "structure = sf_depth.core.covariance:make_structure",
+        ],
         "console_scripts": ["node = sf_depth.node:main"],
     },
 )

@@ -17,10 +17,11 @@ from scipy.spatial import cKDTree
 from sf_interfaces.types import Float32, Float64
 
 _CELLS = (1, 4, 16, 64)  # px; the densest kept observation per cell of each density
+_SPARSER = 3  # a density is kept if it holds this many times fewer than the one before
 _BORDER = 3  # px; of dense depth, only what lies this near a gap is kept at the highest density
 _NEIGHBOURS = 12  # observations a plane is fitted to
 _CANDIDATES = 16  # nearest observations of each density that a tile chooses from
-_SECTORS = 8
+_SECTORS = 16
 _PLANE_TOLERANCE = 0.005  # relative deviation at which an observation counts a quarter for its neighbour's plane
 _PLANE_ROUNDS = 6
 _RIDGE = 0.1  # px^2; keeps a slope that its neighbours do not determine at zero
@@ -56,8 +57,10 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
     indices, trees, nears, spacings, first = [], [], [], [], []
     for cell in _CELLS:
         index = np.argwhere(measured & gap) if cell == 1 else _thinned(everywhere, cell)
-        if indices and len(index) < 2 * _NEIGHBOURS:
+        if indices and len(index) <= _NEIGHBOURS:
             break
+        if indices and _SPARSER * len(index) > len(indices[-1]) and cell > 1:
+            continue
         if len(index) < 2:
             index = everywhere
         tree = cKDTree(index)

@@ -7,7 +7,9 @@ no training: correlation shortens across image edges, and colours that differ do
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from typing import Protocol
 
 import cv2
@@ -15,8 +17,10 @@ import numpy as np
 import torch
 
 from sf_depth.config import DepthConfig
+from sf_interfaces.errors import ConfigError
 from sf_interfaces.types import UInt8
 
+ENTRY_POINT_GROUP = "scenefactory.covariance"
 _JITTER = 1e-8  # under the root, so that the kernel is smooth at zero distance
 
 
@@ -72,20 +76,32 @@ def kernel(
         E1, E2: neighbourhood shapes [B, N, 3], [B, M, 3] px^2 (xx, xy, yy).
         c1, c2: features [B, N, C], [B, M, C].
     """
-    d = x1[:, :, None] - x2[:, None]
-    s = E1[:, :, None] + E2[:, None]
-    det = s[..., 0] * s[..., 2] - s[..., 1] ** 2
-    dx, dy = d[..., 0], d[..., 1]
-    q = 0.5 * (s[..., 2] * dx * dx - 2.0 * s[..., 1] * dx * dy + s[..., 0] * dy * dy) / det
-    r = torch.sqrt(3.0 * q + _JITTER)
-    det1 = (E1[..., 0] * E1[..., 2] - E1[..., 1] ** 2)[:, :, None]
-    det2 = (E2[..., 0] * E2[..., 2] - E2[..., 1] ** 2)[:, None]
-    norm = 2.0 * (det1 * det2) ** 0.25 / torch.sqrt(det)
-    squares = (c1 * c1).sum(dim=2)[:, :, None] + (c2 * c2).sum(dim=2)[:, None]
-    color = (squares - 2.0 * c1 @ c2.transpose(1, 2)).clamp_min(0.0)
-    return norm * (1.0 + r) * torch.exp(-r - 0.5 * color)
+    (px, py), (qx, qy) = (x.unbind(dim=2) for x in (x1, x2))
+    (pxx, pxy, pyy), (qxx, qxy, qyy) = (E.unbind(dim=2) for E in (E1, E2))
+    dx, dy = px[..., None] - qx[:, None], py[..., None] - qy[:, None]
+    xx, xy, yy = pxx[..., None] + qxx[:, None], pxy[..., None] + qxy[:, None], pyy[..., None] + qyy[:, None]
+    det = xx * yy - xy * xy
+    Q = 0.5 * (yy * dx * dx - 2.0 * xy * dx * dy + xx * dy * dy) / det
+    r = torch.sqrt(3.0 * Q + _JITTER)
+    root = (pxx * pyy - pxy * pxy)[..., None] ** 0.25 * (qxx * qyy - qxy * qxy)[:, None] ** 0.25
+    squares = (c1 * c1).sum(dim=2)[..., None] + (c2 * c2).sum(dim=2)[:, None]
+    color = (squares - 2.0 * c1 @ c2.transpose(1, 2)).clamp_min_(0.0)
+    return 2.0 * root * torch.rsqrt(det) * (1.0 + r) * torch.exp(-r - 0.5 * color)
+
+
+def make_structure(config: DepthConfig) -> CovarianceModel:
+    """Covariance from image structure, which needs no weights."""
+    return StructureCovariance(config.covariance_color_scale, config.edge_strength)
 
 
 def make_covariance(config: DepthConfig) -> CovarianceModel:
-    """The covariance that the configuration names."""
-    return StructureCovariance(config.covariance_color_scale, config.edge_strength)
+    """The covariance that the configuration names, one of entry-point group ``scenefactory.covariance``.
+
+    Raises:
+        ConfigError: no installed package provides it, or its weights are missing.
+    """
+    found = {point.name: point for point in entry_points(group=ENTRY_POINT_GROUP)}
+    if config.covariance not in found:
+        raise ConfigError(f"no covariance '{config.covariance}' is installed; choose one of {', '.join(sorted(found))}")
+    make: Callable[[DepthConfig], CovarianceModel] = found[config.covariance].load()
+    return make(config)

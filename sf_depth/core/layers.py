@@ -16,7 +16,7 @@ from sf_depth.core.conditioning import Observations
 _TRUST = 3.0  # a plane is extended this many spacings of its observations
 _CLIP = 1.3  # and changes by this factor at most
 _AGREE = 0.03  # relative deviation of planes that belong to one surface
-_SUSPECT = 0.1  # relative distance behind its surroundings at which an observation counts half
+_SUSPECT = 1.0  # log distance behind its surroundings at which an observation counts half
 _SAMPLES = (0.25, 0.5, 0.75)  # where the colour is looked up between a pixel and an observation
 _BARRIER = 0.7  # how much a colour step in between counts against one at the ends
 _SOFT = 0.25  # share of the spacing below which all observations are equally near

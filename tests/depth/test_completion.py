@@ -94,7 +94,7 @@ def test_the_kernel_is_a_correlation() -> None:
     pixels = StructureCovariance(0.1, 1.0)(rng.integers(0, 255, (40, 40, 3), dtype=np.uint8), 6.0)
     row, col = rng.integers(0, 40, (2, 30))
     x = torch.tensor(np.stack([col, row], -1), dtype=torch.float32)[None]
-    E, c = torch.tensor(pixels.shape[row, col])[None], torch.tensor(pixels.feature[row, col])[None]
+    E, c = pixels.shape[row, col][None], pixels.feature[row, col][None]
     K = kernel(x, E, c, x, E, c)[0]
     assert torch.allclose(K, K.T, atol=1e-5) and torch.allclose(K.diagonal(), torch.ones(30), atol=1e-3)
     assert torch.linalg.eigvalsh(K.double()).min() > -1e-4
