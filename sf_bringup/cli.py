@@ -19,6 +19,17 @@ PASSED_ON = {
     "play": ("sf_bringup.player", "publish a bag, live or lossless"),
     "record": ("sf_bringup.recorder", "record topics to mcap"),
 }
+_EXPORTS = {
+    "tum": "trajectory.tum",
+    "kitti": "trajectory.kitti",
+    "euroc": "trajectory.csv in EuRoC's columns",
+    "ply": "coloured surface and mesh",
+    "glb": "coloured mesh as binary glTF",
+    "depth": "keyframe depth as 16-bit PNG (mm) and NPZ with variance",
+    "colmap": "COLMAP text model with images",
+    "mvsnet": "images, cameras and pairs as MVSNet reads them",
+    "nerfstudio": "transforms.json with images and depth",
+}
 GOALS = ("auto", "tracking", "slam", "recon", "mvd", "completion")
 
 
@@ -149,7 +160,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from sf_bringup.products import render_views
+    from sf_bringup.looking import render_views
 
     count = render_views(args.run, args.poses, args.out)
     _print({"views": count}, args.json, f"wrote {count} views to {args.out}")
@@ -157,32 +168,38 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _view(args: argparse.Namespace) -> int:
-    from sf_bringup.products import view
+    from sf_bringup.looking import view
 
-    view(args.run)
+    view(args.run, args.host, args.port, lambda url: _print({"url": url}, args.json, f"{url}   (Ctrl-C ends)"))
     return 0
 
 
 def _export(args: argparse.Namespace) -> int:
-    from sf_bringup.products import export
+    from sf_bringup.export import export
 
-    written = export(args.run, args.out, tum=args.tum, kitti=args.kitti, ply=args.ply)
-    _print([str(p) for p in written], args.json, "\n".join(f"wrote {p}" for p in written))
+    wanted = [name for name in _EXPORTS if getattr(args, name)]
+    written, left_out = export(args.run, args.out, wanted, args.frame)
+    lines = [*(f"wrote {p}" for p in written), *(f"no {name}: {why}" for name, why in left_out.items())]
+    _print({"written": [str(p) for p in written], "left_out": left_out}, args.json, "\n".join(lines))
     return 0
 
 
 def _eval(args: argparse.Namespace) -> int:
-    from sf_bringup.measures import MEASURES
+    from sf_bringup.eval_command import eval_command
 
-    value = MEASURES[args.measure](args)
-    _print(value, args.json, "\n".join(f"{key:18} {number}" for key, number in value.items()))
-    return 0
+    return eval_command(args)
 
 
 def _report(args: argparse.Namespace) -> int:
+    from sf_bringup.bench_report import is_run, write_bench_page
+    from sf_bringup.run_folder import RunFolder
     from sf_bringup.summary import summarise, write_page
 
-    summary = summarise(args.run)
+    if not is_run(args.run):
+        page = write_bench_page(args.run)
+        _print({"report": str(page)}, args.json, f"wrote {page}")
+        return 0
+    summary = summarise(RunFolder.open(args.run))
     write_page(summary)
     _print(summary.values, args.json, summary.text())
     return 0
@@ -220,6 +237,20 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
         help="take this topic as rgb, depth, lidar or pose",
     )
     parser.add_argument("--use", action="append", default=[], metavar="BLOCK", help="prefer this block (sf blocks)")
+
+
+def _add_export(p: argparse.ArgumentParser) -> None:
+    p.add_argument("run", type=Path)
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--frame", choices=("camera", "base_link", "lidar"), default="camera", help="whose trajectory")
+    for form, what in _EXPORTS.items():
+        p.add_argument(f"--{form}", action="store_true", help=what)
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
+    parser.add_argument("--port", type=int, default=8080)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -266,20 +297,18 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("run", type=Path)
     p.add_argument("--poses", type=Path, required=True, help="T_map_camera in TUM format")
     p.add_argument("--out", type=Path, required=True)
-    verb("view", _view, "show the surface of a finished run").add_argument("run", type=Path)
+    _add_view(verb("view", _view, "serve a page that shows the map of a finished run"))
 
-    p = verb("export", _export, "write the results of a run in other formats")
-    p.add_argument("run", type=Path)
-    p.add_argument("--out", type=Path, required=True)
-    for form in ("tum", "kitti", "ply"):
-        p.add_argument(f"--{form}", action="store_true")
+    p = verb("export", _export, "write the results of a run in other formats; without a format: all it has")
+    _add_export(p)
 
-    p = verb("eval", _eval, "measure a run against its reference")
-    p.add_argument("measure", choices=("traj", "depth", "completion", "render"))
-    p.add_argument("run", type=Path)
-    p.add_argument("--reference", type=Path, help="TUM trajectory (default: /ground_truth/pose of the input)")
-    p.add_argument("--holdout", type=float, default=0.5, help="fraction of LiDAR points to predict (completion)")
-    verb("report", _report, "write report.html and the picture of a run").add_argument("run", type=Path)
+    from sf_bringup import eval_command
+
+    p = verbs.add_parser("eval", help="measure a run or plain files against a reference")
+    p.set_defaults(action=_eval)
+    eval_command.add_arguments(p)
+    p = verb("report", _report, "write report.html of a run, or of a folder of benchmark results")
+    p.add_argument("run", type=Path, help="folder of a run, or of JSON files")
     return parser
 
 

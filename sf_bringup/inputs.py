@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -32,13 +33,8 @@ def convert(dataset: Path, out: Path, options: ReadOptions) -> tuple[Written, di
         SceneFactoryError: no such folder, its layout is not known, or a file of it is bad.
     """
     recognised = datasets.recognise(dataset, options.depth_scale)
-    unfinished = out.with_name(f"{out.stem}.unfinished{out.suffix}")
-    try:
-        with SequenceWriter(unfinished) as writer, Progress("reading", "frames") as progress:
-            written = datasets.write(recognised, writer, options, progress.update)
-        unfinished.rename(out)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    with _whole(out) as unfinished, SequenceWriter(unfinished) as writer, Progress("reading", "frames") as progress:
+        written = datasets.write(recognised, writer, options, progress.update)
     with BagReader(out) as reader:
         return written, {name: info.count for name, info in sorted(reader.topics.items())}
 
@@ -73,30 +69,24 @@ def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolv
     return Resolved(converted, tuple(notes), written.goal)
 
 
-@dataclass(frozen=True, slots=True)
-class Given:
-    """What the user gave beside a bag.
-
-    Args:
-        camera, distortion: published beside every image on the image's namespace, replacing camera_info there.
-        poses: TUM file, published as /sf/pose.
-        extrinsic: (camera frame, lidar frame, T_camera_lidar), published on /tf_static.
-    """
-
-    camera: Camera | None = None
-    distortion: Distortion | None = None
-    poses: Path | None = None
-    extrinsic: tuple[str, str, Float64] | None = None
-
-    def __bool__(self) -> bool:
-        return not (self.camera is None and self.poses is None and self.extrinsic is None)
-
-
-def with_given(bag: Path, out: Path, given: Given, image_topic: str, limit: int | None = None) -> Path:
+def with_given(
+    bag: Path,
+    out: Path,
+    *,
+    image_topic: str,
+    camera: Camera | None,
+    distortion: Distortion | None = None,
+    poses: Path | None,
+    extrinsic: tuple[str, str, Float64] | None,
+    limit: int | None = None,
+) -> Path:
     """A copy of the bag that also carries what the user gave beside it, so that every engine sees the same.
 
     Args:
-        image_topic: the stream that the camera belongs to.
+        image_topic: the stream that ``camera`` belongs to.
+        camera, distortion: published beside every image on the image's namespace, replacing camera_info there.
+        poses: TUM file, published as /sf/pose.
+        extrinsic: (camera frame, lidar frame, T_camera_lidar), published on /tf_static.
         limit: copy only the first so many messages of each topic.
 
     Returns:
@@ -106,25 +96,36 @@ def with_given(bag: Path, out: Path, given: Given, image_topic: str, limit: int 
         CalibrationError: the images are not of the size of the given camera.
         FormatError: the poses cannot be read.
     """
-    if not given:
+    if camera is None and poses is None and extrinsic is None:
         return bag
     target = out / "input_with_given.mcap"
     info_topic = image_topic.rsplit("/", 1)[0] + "/camera_info"
-    with BagReader(bag) as reader, SequenceWriter(target) as writer:
-        if given.extrinsic is not None:
-            writer.tf_static(*given.extrinsic, stamp_ns=reader.start_ns)
-        if given.poses is not None:
-            trajectory = read_tum(given.poses)
+    with _whole(target) as unfinished, BagReader(bag) as reader, SequenceWriter(unfinished) as writer:
+        if extrinsic is not None:
+            writer.tf_static(*extrinsic, stamp_ns=reader.start_ns)
+        if poses is not None:
+            trajectory = read_tum(poses)
             for stamp, T in zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True):
                 writer.pose(topics.GIVEN_POSE.name, stamp, T, "map")
         for raw in _messages(reader, limit):
-            if given.camera is not None and raw.topic == info_topic:
+            if camera is not None and raw.topic == info_topic:
                 continue
             writer.bag.write(raw.topic, raw.type, raw.stamp_ns, raw.data)
-            if given.camera is not None and raw.topic == image_topic:
-                camera = _of_stream(given.camera, reader.decode(raw), bag)
-                writer.camera_info(info_topic, raw.stamp_ns, camera, given.distortion)
+            if camera is not None and raw.topic == image_topic:
+                own = _of_stream(camera, reader.decode(raw), bag)
+                writer.camera_info(info_topic, raw.stamp_ns, own, distortion)
     return target
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Where to write a file that gets its name only when it is whole (and may replace the one being read)."""
+    unfinished = path.with_name(f"{path.stem}.unfinished{path.suffix}")
+    try:
+        yield unfinished
+        unfinished.rename(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def _messages(reader: BagReader, limit: int | None) -> Iterator[RawMessage]:

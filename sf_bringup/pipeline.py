@@ -6,7 +6,8 @@ The ROS graph runs the same cores on the same data; on a lossless replay both gi
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sf_bringup import photo_set
 from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.progress import Progress
@@ -24,11 +26,11 @@ from sf_interfaces.blocks import BlockSpec, Quantity, load_blocks
 from sf_interfaces.config import ConfigFile, build
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.io.bag import BagReader
-from sf_interfaces.io.cloud import write_surface
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import write_tum
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.sync import SyncConfig
+from sf_interfaces.timing import Timings
 from sf_interfaces.types import Float64, Frame, Keyframe, Scale, Trajectory
 
 PARTS_GROUP = "scenefactory.parts"
@@ -66,8 +68,11 @@ class ProductionLine:
         self._tracker_id = owner.get(Quantity.POSE, "")
         self.tracker = parts.get(self._tracker_id)
         self._completer = parts.get("depth:complete")
+        self._posed_depth = "depth:posed" in blocks
+        self._sequence = parts.get("depth:slam") or parts.get("depth:posed")
         self.reconstruction = parts.get("recon")
         self._writer, self._config, self._epoch = writer, config, 0
+        self.timings = Timings()
         writer.posed = self.tracker is not None or posed
         self.keyframe_poses: list[tuple[int, Float64]] = []
 
@@ -76,6 +81,8 @@ class ProductionLine:
         if self.tracker is not None and epoch != self._epoch:
             self._finish_keyframes(self.tracker.finish().keyframes)
             self.tracker = make_part(self._tracker_id, self._config)
+        if self._sequence is not None and epoch != self._epoch:
+            self._densified(self._sequence.finish())
         self._epoch = epoch
 
     def step(self, frame: Frame) -> Float64 | None:
@@ -89,7 +96,8 @@ class ProductionLine:
             self._writer.flexion(frame, image)
             frame = replace(frame, image=image)
         if self.tracker is not None:
-            update = self.tracker.track(frame)
+            with self.timings.measure("tracking"):
+                update = self.tracker.track(frame)
             self._writer.tracked(frame, update)
             self._finish_keyframes(update.keyframes)
             return update.T_map_camera if update.scale is Scale.METRIC else None
@@ -99,7 +107,8 @@ class ProductionLine:
             sparse = frame.sparse_depth
             depth = frame.depth if sparse is None else sparse.to_map(frame.camera.height, frame.camera.width)
             keyframe = Keyframe(frame.stamp_ns, frame.camera, frame.image, T, depth)
-            self._writer.keyframe(keyframe)
+            if not self._posed_depth:
+                self._writer.keyframe(keyframe)
             self._complete(keyframe)
         return None
 
@@ -107,6 +116,8 @@ class ProductionLine:
         """End of the input: the tracker's window becomes final, the colour field gets its last sweeps."""
         if self.tracker is not None:
             self._finish_keyframes(self.tracker.finish().keyframes)
+        if self._sequence is not None:
+            self._densified(self._sequence.finish())
         if self.reconstruction is not None:
             self.reconstruction.finish()
 
@@ -116,12 +127,34 @@ class ProductionLine:
             self._writer.keyframe(keyframe)
             self._complete(keyframe)
 
+    @property
+    def reasons(self) -> dict[str, int]:
+        """Why keyframes got no depth, with counts."""
+        return {} if self._sequence is None else dict(self._sequence.reasons)
+
     def _complete(self, keyframe: Keyframe) -> None:
+        if self._sequence is not None:
+            self._densified(self._sequence.add(keyframe))
+            return
         if self._completer is not None:
-            keyframe = self._completer.complete(keyframe)
+            with self.timings.measure("depth"):
+                keyframe = self._completer.complete(keyframe)
             self._writer.dense(keyframe)
+        self._reconstruct(keyframe)
+
+    def _densified(self, keyframes: Sequence[Keyframe]) -> None:
+        """Keyframes that multi-view depth has given depth to, some frames after they came."""
+        for keyframe in keyframes:
+            if self._posed_depth:
+                self._writer.keyframe(replace(keyframe, depth=None))
+            self._writer.dense(keyframe)
+            self._reconstruct(keyframe)
+
+    def _reconstruct(self, keyframe: Keyframe) -> None:
         if self.reconstruction is not None:
-            self._writer.surface(keyframe.stamp_ns, self.reconstruction.add(keyframe))
+            with self.timings.measure("recon"):
+                added = self.reconstruction.add(keyframe)
+            self._writer.surface(keyframe.stamp_ns, added)
 
 
 def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float) -> dict[str, int]:
@@ -138,13 +171,9 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
     """
     if rate:
         raise ConfigError("--rate plays live through the graph; add --engine ros")
-    roles = given.mapping.roles
-    head = replace(made.steps[0], spec=_head_spec(made))
-    values = {**sync_values(made, roles, head), **config.sections.get("sync", {})}
-    values["image"] = "rgb" in roles
-    inputs = SensorInputs(build(SyncConfig, values, "section 'sync'"), lossless=True)
-    kinds = {topic: _KIND[role] for role, topic in roles.items()}
-    kinds |= {topic: topic[1:] for topic in given.transform_topics}
+    if photo_set.is_photo_set(made):
+        return _run_photo_set(folder, given, made, config)
+    inputs = _inputs(given, made, config)
     with (
         BagReader(given.bag) as reader,
         ResultWriter(SequenceWriter(folder.result)) as writer,
@@ -152,18 +181,59 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
     ):
         line = ProductionLine(made.ids, config, writer, posed=Quantity.POSE in made.available)
         done = 0
-        for raw in reader.messages(list(kinds)):
-            inputs.push(kinds[raw.topic], reader.decode(raw))
+        for message in _messages(reader, given):
+            inputs.push(*message)
             done += _advance(line, inputs)
             progress.update(done, given.leading_messages)
         inputs.assembler.end()
         done += _advance(line, inputs)
         if not done:
-            reasons = "; ".join(inputs.assembler.reasons) or "it has no message on the chosen topics"
-            raise FormatError(f"no frame of {given.bag} could be used: {reasons}")
+            raise _unused(given, inputs)
         line.finish()
         _save(folder, line, writer)
-    return dict(inputs.assembler.reasons)
+    return dict(inputs.assembler.reasons) | line.reasons
+
+
+def _inputs(given: BagInput, made: Plan, config: ConfigFile) -> SensorInputs:
+    """The sensor streams the line joins."""
+    roles = given.mapping.roles
+    head = replace(made.steps[0], spec=_head_spec(made))
+    values = {**sync_values(made, roles, head), **config.sections.get("sync", {})}
+    values["image"] = "rgb" in roles
+    return SensorInputs(build(SyncConfig, values, "section 'sync'"), lossless=True)
+
+
+def _messages(reader: BagReader, given: BagInput) -> Iterator[tuple[str, Any]]:
+    """(kind, message) of everything the line takes in."""
+    kinds = {topic: _KIND[role] for role, topic in given.mapping.roles.items()}
+    kinds |= {topic: topic[1:] for topic in given.transform_topics}
+    for raw in reader.messages(list(kinds)):
+        yield kinds[raw.topic], reader.decode(raw)
+
+
+def _unused(given: BagInput, inputs: SensorInputs) -> FormatError:
+    reasons = "; ".join(inputs.assembler.reasons) or "it has no message on the chosen topics"
+    return FormatError(f"no frame of {given.bag} could be used: {reasons}")
+
+
+def _run_photo_set(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile) -> dict[str, int]:
+    """The one-shot goal: all images at once."""
+    reasons: dict[str, int] = {}
+    if Quantity.INTRINSICS in made.available:
+        inputs = _inputs(given, made, config)
+        with BagReader(given.bag) as reader:
+            for message in _messages(reader, given):
+                inputs.push(*message)
+        inputs.assembler.end()
+        frames = list(inputs.assembler.ready())
+        reasons = dict(inputs.assembler.reasons)
+        if not frames:
+            raise _unused(given, inputs)
+    else:
+        frames = photo_set.frames_without_camera(given)
+    with ResultWriter(SequenceWriter(folder.result)) as writer, Progress("estimating", "images") as progress:
+        progress.update(0, len(frames))
+        return reasons | photo_set.estimate(make_part(photo_set.MVD, config), frames, folder, writer)
 
 
 def _advance(line: ProductionLine, inputs: SensorInputs) -> int:
@@ -171,7 +241,9 @@ def _advance(line: ProductionLine, inputs: SensorInputs) -> int:
     done = 0
     for frame in inputs.assembler.ready():
         line.in_epoch(inputs.assembler.epoch)
-        inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
+        with line.timings.measure("frame"):
+            pose = line.step(frame)
+        inputs.assembler.feed_back(frame.stamp_ns, pose)
         done += 1
     return done
 
@@ -188,12 +260,12 @@ def _head_spec(made: Plan) -> BlockSpec:
 
 
 def _save(folder: RunFolder, line: ProductionLine, writer: ResultWriter) -> None:
-    """The files that the nodes of the graph write at their end."""
+    """The files that the nodes of the graph write at their end, and where the time went."""
+    (folder.path / "timing.json").write_text(json.dumps(line.timings.to_dict()))
     if line.tracker is not None:
         trajectory = line.tracker.trajectory()
         write_tum(folder.path / "trajectory.tum", trajectory)
         write_tum(folder.path / "keyframes.tum", Trajectory.from_pairs(line.keyframe_poses, trajectory.scale))
         writer.path(trajectory)
     if line.reconstruction is not None:
-        line.reconstruction.save(folder.map)
-        write_surface(folder.path / "surface.ply", line.reconstruction.surface())
+        line.reconstruction.save_products(folder.path)

@@ -16,6 +16,7 @@ from typing import Any
 import yaml
 
 from sf_bringup import inputs, preflight
+from sf_bringup.calibration import calibrated
 from sf_bringup.planner import Plan, plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.run_folder import RunFolder, unpack
@@ -26,6 +27,7 @@ from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.io.calibration import read_camera, read_extrinsic
 from sf_interfaces.io.datasets import ReadOptions
+from sf_interfaces.types import Float64
 
 _VERSIONED = (
     "scenefactory",
@@ -82,11 +84,18 @@ def prepare(request: RunRequest) -> tuple[BagInput, inputs.Resolved]:
         mapping.setdefault("pose", topics.GROUND_TRUTH_PREFIX + "pose")
     found = preflight.inspect(source.bag, mapping)
     leader = found.mapping.roles.get("rgb", found.mapping.roles.get("depth", ""))
-    given = _given(request, found)
-    if given:
-        bag = inputs.with_given(source.bag, request.out, given, leader, request.reading.limit)
-        found = preflight.inspect(bag, mapping)
-    return found, source
+    camera, distortion = (None, None) if request.calibration is None else read_camera(request.calibration)
+    bag = inputs.with_given(
+        source.bag,
+        request.out,
+        image_topic=leader,
+        camera=camera,
+        distortion=distortion,
+        poses=request.poses,
+        extrinsic=_extrinsic(request, found),
+        limit=request.reading.limit,
+    )
+    return (found if bag == source.bag else preflight.inspect(bag, mapping)), source
 
 
 def _planned(request: RunRequest, given: BagInput, source: inputs.Resolved) -> Plan:
@@ -95,16 +104,14 @@ def _planned(request: RunRequest, given: BagInput, source: inputs.Resolved) -> P
     return plan(given.mapping.available, goal, load_blocks(), request.use)
 
 
-def _given(request: RunRequest, found: BagInput) -> inputs.Given:
-    """What the user gave beside the input, read."""
-    camera, distortion = (None, None) if request.calibration is None else read_camera(request.calibration)
+def _extrinsic(request: RunRequest, found: BagInput) -> tuple[str, str, Float64] | None:
+    """The user's (camera frame, lidar frame, T_camera_lidar)."""
     if request.extrinsic is None:
-        return inputs.Given(camera, distortion, request.poses)
+        return None
     if "lidar" not in found.mapping.roles:
         raise ConfigError(f"--extrinsic {request.extrinsic}: the input has no LiDAR to place")
     frame = found.frames["rgb" if "rgb" in found.frames else "depth"]
-    extrinsic = (frame, found.frames["lidar"], read_extrinsic(request.extrinsic))
-    return inputs.Given(camera, distortion, request.poses, extrinsic)
+    return frame, found.frames["lidar"], read_extrinsic(request.extrinsic)
 
 
 def explain(request: RunRequest) -> tuple[dict[str, Any], str]:
@@ -145,7 +152,8 @@ def run(request: RunRequest) -> Summary:
     folder = RunFolder(request.out)
     _write_facts(folder, request, given, source, made, config)
     started = time.monotonic()
-    dropped = _engine(request.engine)(folder, given, made, config, request.rate)
+    given, rest = calibrated(given, made, config, request.out)
+    dropped = _engine(request.engine)(folder, given, rest, config, request.rate)
     facts = folder.info() | {"seconds": time.monotonic() - started, "dropped": dropped}
     (folder.path / "run.json").write_text(json.dumps(facts, indent=2))
     unpack(folder)

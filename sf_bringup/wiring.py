@@ -75,6 +75,8 @@ def launches(
     """
     plan.check_runnable()
     first = plan.steps[0]
+    if first.spec.id == "depth:mvd":
+        raise PlanError("an image set is estimated at once, in one process: leave --engine ros out")
     if first.spec.name == "depth" and Q.POSE not in plan.available:
         raise PlanError(
             "single frames without poses are completed in one process: leave --engine ros out, or use --goal recon"
@@ -114,6 +116,8 @@ def _launch(
         parameters["upstream"] = upstream
     if made_image:
         remaps[topics.RGB_IMAGE.name] = topics.FLEXION_IMAGE.name
+    if step.spec.mode:
+        parameters["mode"] = step.spec.mode
     parameters |= dict(config.sections.get(step.spec.name, {}))
     if source == "sensors":
         carried = [stream for stream in compressed if not (made_image and stream == "image")]

@@ -1,16 +1,19 @@
-"""The depth node: keyframes with sparse depth in, the same keyframes with dense depth and variance out."""
+"""The depth node: keyframes in, the same keyframes with dense depth and variance out."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
+from sf_depth.core.sequence import EachDepth, PosedSetting, SequenceDepth, SlamSetting
 from sf_interfaces import topics
+from sf_interfaces.errors import ConfigError
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.bundles import COMPLETED, publish_bundle
 from sf_interfaces.ros.keyframes import KeyframeSource
@@ -20,7 +23,7 @@ from sf_interfaces.types import Keyframe, PointCloud
 
 
 class DepthNode(BlockNode):
-    """Completes the depth (Sec. III-C), mode ``complete``.
+    """Completes the depth (Sec. III-C): sparse depth (mode ``complete``) or none (``slam``, ``posed``).
 
     With ``source: sensors`` it is the head of its line and sends the colour of its keyframes too.
     """
@@ -32,7 +35,7 @@ class DepthNode(BlockNode):
     def setup(self) -> None:
         """The completer and its keyframes."""
         self.leader = ""
-        self._completer = DepthCompleter(self.config())
+        self._depth = self._part(self.config())
         self._source = KeyframeSource(self, landmarks=True)
         self._head = self.options.source == "sensors"
         self._parts = set(COMPLETED) if self._head else set(COMPLETED) - {"image"}
@@ -43,27 +46,43 @@ class DepthNode(BlockNode):
     def take(self, kind: str, msg: Any) -> None:
         """Complete the keyframes one message makes ready."""
         for keyframe in self._source.push(kind, msg):
-            self.guarded(lambda keyframe=keyframe: self._complete(keyframe))  # type: ignore[misc]
+            self.guarded(lambda keyframe=keyframe: self._send(self._depth.add(keyframe)))  # type: ignore[misc]
 
     def finish(self) -> None:
         """Complete what was still waiting."""
         for keyframe in self._source.end():
-            self.guarded(lambda keyframe=keyframe: self._complete(keyframe))  # type: ignore[misc]
+            self.guarded(lambda keyframe=keyframe: self._send(self._depth.add(keyframe)))  # type: ignore[misc]
+        self.guarded(lambda: self._send(self._depth.finish()))
 
     def refresh(self) -> None:
         """Why input was dropped."""
         if self.leader:
-            self.health.set_drops(self._source.reasons)
+            self.health.set_drops(self._source.reasons | self._depth.reasons)
             self.health.waiting(self._source.waiting_for)
 
-    def _complete(self, keyframe: Keyframe) -> None:
-        dense = self._completer.complete(keyframe)
-        publish_bundle(self, dense, COMPLETED, self._parts)
-        self.health.count("keyframes completed")
-        if self.wanted(topics.DENSE_POINTS):
-            self.output(topics.DENSE_POINTS).publish(messages.encode_cloud(messages.rclpy_factory, _points(dense)))
-        self.sent_one(dense.stamp_ns)
-        self._source.done(dense.stamp_ns)
+    @staticmethod
+    def _part(config: DepthConfig) -> SequenceDepth | EachDepth:
+        """The core of the configured mode.
+
+        Raises:
+            ConfigError: the mode does not run as a node.
+        """
+        if config.mode == "complete":
+            return EachDepth(DepthCompleter(config))
+        if config.mode == "slam":
+            return SequenceDepth(config, SlamSetting())
+        if config.mode == "posed":
+            return SequenceDepth(config, PosedSetting(config.keyframe_baseline))
+        raise ConfigError(f"mode '{config.mode}' of the depth node is not known; use complete, slam or posed")
+
+    def _send(self, keyframes: Sequence[Keyframe]) -> None:
+        for dense in keyframes:
+            publish_bundle(self, dense, COMPLETED, self._parts)
+            self.health.count("keyframes completed")
+            if self.wanted(topics.DENSE_POINTS):
+                self.output(topics.DENSE_POINTS).publish(messages.encode_cloud(messages.rclpy_factory, _points(dense)))
+            self.sent_one(dense.stamp_ns)
+            self._source.done(dense.stamp_ns)
 
 
 def _points(keyframe: Keyframe) -> PointCloud:

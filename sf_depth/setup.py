@@ -18,7 +18,13 @@ setup(
     ],
     entry_points={
         "scenefactory.blocks": ["depth = sf_depth.block:SPECS"],
-        "scenefactory.parts": ["depth:complete = sf_depth.block:make"],
+        "scenefactory.parts": [
+            "depth:calibrate = sf_depth.block:make_calibrate",
+            "depth:complete = sf_depth.block:make",
+            "depth:mvd = sf_depth.block:make_mvd",
+            "depth:posed = sf_depth.block:make_posed",
+            "depth:slam = sf_depth.block:make_slam",
+        ],
         "console_scripts": ["node = sf_depth.node:main"],
     },
 )

@@ -20,7 +20,7 @@ from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.types import Camera, DepthMap, PointCloud
 
 SMALL = {"scene": "lounge", "frames": 14, "fps": 10.0, "width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
-FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.keyframe_pixels=16384"]
+FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.pixels=1024"]
 
 
 @pytest.fixture(scope="module")

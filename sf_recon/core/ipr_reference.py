@@ -25,6 +25,9 @@ from numpy.typing import NDArray
 
 from sf_interfaces.types import Camera, Float32, Float64
 
+MIN_STEP = 1e-5  # of the depth; pixels that show the same point differ by rounding only
+MIN_SINE = 1e-2  # of the angle between two differences that span a surface
+
 
 @dataclass(frozen=True, slots=True)
 class RasterOptions:
@@ -154,6 +157,9 @@ def normals_of(position: Float32, layer_gap: float) -> Float32:
         step: Float32 = ends[1] - ends[0]
         return step
 
-    normal = np.cross(difference(0), difference(1))
-    norm = np.linalg.norm(normal, axis=2, keepdims=True)
-    return np.where(norm > 0, normal / np.where(norm > 0, norm, 1), np.nan).astype(np.float32)
+    x, y = difference(1), difference(0)
+    normal = np.cross(y, x)
+    norm, across, down = (np.linalg.norm(v, axis=2, keepdims=True) for v in (normal, x, y))
+    with np.errstate(invalid="ignore"):
+        sound = (np.minimum(across, down) > MIN_STEP * position[..., 2:]) & (norm > MIN_SINE * across * down)
+    return np.where(sound, normal / np.where(sound, norm, 1), np.nan).astype(np.float32)

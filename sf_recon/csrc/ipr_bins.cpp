@@ -63,6 +63,7 @@ void Binner::project(const float* points, size_t first, size_t last, const Raste
     first_[chunk] = first;
     found_[chunk] = static_cast<size_t>(out - (visible_.get() + first));
     covers_[chunk] = covers;
+    count(chunk);
 }
 
 void Binner::count(int chunk) {
@@ -78,8 +79,9 @@ void Binner::count(int chunk) {
 
 // Close-ups: the k_ray nearest points that cover a whole tile fill all its pixels; what lies behind them is culled, so
 // that memory does not grow with the area of the windows.
-void Binner::bound_tiles(const RasterSpec& s, int chunks) {
-    if (std::find(covers_.begin(), covers_.begin() + chunks, 1) == covers_.begin() + chunks) return;
+// Returns whether there is any such tile.
+bool Binner::bound_tiles(const RasterSpec& s, int chunks) {
+    if (std::find(covers_.begin(), covers_.begin() + chunks, 1) == covers_.begin() + chunks) return false;
     std::vector<std::vector<float>> nearest(bound_.size());  // heaps, the farthest on top
     for (int c = 0; c < chunks; ++c)
         for (const Visible* v = visible_.get() + first_[c]; v < visible_.get() + first_[c] + found_[c]; ++v) {
@@ -102,6 +104,7 @@ void Binner::bound_tiles(const RasterSpec& s, int chunks) {
                     if (heap.size() == static_cast<size_t>(s.k_ray)) bound_[tile] = heap.front();
                 }
         }
+    return true;
 }
 
 // Turns counts into write positions; returns the number of fragments.
@@ -141,9 +144,11 @@ const Bins& Binner::bin(const float* points, size_t n, const RasterSpec& s, int 
     bins_.begin.resize(tiles + 1);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
     for (int c = 0; c < chunks; ++c) project(points, n * c / chunks, n * (c + 1) / chunks, s, c);
-    bound_tiles(s, chunks);
+    if (bound_tiles(s, chunks)) {
+        offset_.assign(chunks * tiles, 0);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
-    for (int c = 0; c < chunks; ++c) count(c);
+        for (int c = 0; c < chunks; ++c) count(c);
+    }
     const size_t total = place(chunks);
     if (bins_.capacity < total) bins_.fragments.reset(new Fragment[bins_.capacity = total + total / 4]);
 #pragma omp parallel for schedule(dynamic, 1) num_threads(threads)

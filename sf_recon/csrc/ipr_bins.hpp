@@ -58,7 +58,7 @@ class Binner {
 
     void project(const float* points, size_t first, size_t last, const RasterSpec& s, int chunk);
     void count(int chunk);
-    void bound_tiles(const RasterSpec& s, int chunks);
+    bool bound_tiles(const RasterSpec& s, int chunks);
     size_t place(int chunks);
     void scatter(int chunk);
 

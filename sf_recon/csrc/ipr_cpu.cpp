@@ -16,6 +16,11 @@ constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr int32_t kClosed = static_cast<int32_t>(0xff800000u);  // bits of -inf
 constexpr float kHole = std::numeric_limits<float>::quiet_NaN();
 
+constexpr float kMinStep = 1e-5f;  // of the depth; pixels that show the same point differ by rounding only
+constexpr float kMinSine = 1e-2f;  // of the angle between two differences that span a surface
+
+inline float norm_of(const float* v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
+
 struct Item {  // a fragment to be sorted
     uint64_t key;     // bits of the depth (positive floats sort like their bits) above the row in the cloud
     uint32_t window;  // x0 | x1 << 8 | y0 << 16 | y1 << 24, pixels of the tile
@@ -27,7 +32,7 @@ struct Item {  // a fragment to be sorted
 
 struct TileScratch {
     std::vector<uint32_t> windows;
-    std::vector<float> u, v, z, per_x2, per_y2;  // of the fragments: pixel, depth, -1 / (sigma * half-width^2)
+    std::vector<float> splats;  // [fragments, 4] u, v, z, -1 / (sigma * half-width^2) along x
     std::vector<Item> items;
     std::vector<uint32_t> list;  // [k_ray + 1, pixels] local numbers, front to back; the last row takes what is too much
     std::vector<float> weight;   // [k_ray, kTile] of one row of pixels
@@ -37,7 +42,7 @@ struct TileScratch {
     void reserve(size_t n) {
         if (windows.size() >= n) return;
         windows.resize(n), items.resize(n);
-        for (auto* values : {&u, &v, &z, &per_x2, &per_y2}) values->resize(n);
+        splats.resize(4 * n);
     }
 };
 
@@ -45,20 +50,23 @@ SF_INLINE void unpack(const RasterSpec& spec, const Fragment* fragments, size_t 
     const RasterSpec s = spec;
     const int right = std::min(left + kTile, s.width) - 1, bottom = std::min(top + kTile, s.height) - 1;
     uint32_t* windows = t.windows.data();
-    float *u = t.u.data(), *v = t.v.data(), *z = t.z.data(), *per_x2 = t.per_x2.data(), *per_y2 = t.per_y2.data();
+    float* splats = t.splats.data();
 #pragma GCC ivdep
     for (size_t i = 0; i < n; ++i) {
-        u[i] = fragments[i].u, v[i] = fragments[i].v, z[i] = fragments[i].z;
-        const float hx = half_width(s, s.fx, z[i]), hy = half_width(s, s.fy, z[i]);
-        per_x2[i] = -1.0f / (s.sigma * hx * hx), per_y2[i] = -1.0f / (s.sigma * hy * hy);
-        const int x0 = first_pixel(u[i], hx, left) - left, x1 = last_pixel(u[i], hx, right) - left;
-        const int y0 = first_pixel(v[i], hy, top) - top, y1 = last_pixel(v[i], hy, bottom) - top;
+        const float u = fragments[i].u, v = fragments[i].v, z = fragments[i].z;
+        const float hx = half_width(s, s.fx, z), hy = half_width(s, s.fy, z);
+        splats[4 * i] = u, splats[4 * i + 1] = v, splats[4 * i + 2] = z;
+        splats[4 * i + 3] = -1.0f / (s.sigma * hx * hx);
+        const int x0 = first_pixel(u, hx, left) - left, x1 = last_pixel(u, hx, right) - left;
+        const int y0 = first_pixel(v, hy, top) - top, y1 = last_pixel(v, hy, bottom) - top;
         windows[i] = static_cast<uint32_t>(x0 | x1 << 8 | y0 << 16 | y1 << 24);
     }
 }
 
 // Groups the fragments by depth into buckets begin[b]..begin[b + 1], nearest first; each is sorted only when needed.
-SF_INLINE void bucket_by_depth(const Fragment* fragments, size_t n, TileScratch& t, uint32_t* begin) {
+// Returns how many buckets there are.
+SF_INLINE int bucket_by_depth(const Fragment* fragments, size_t n, TileScratch& t, uint32_t* begin) {
+    const int buckets = n < 48 ? 16 : n < 192 ? 64 : kBuckets;
     int32_t low = to_bits(fragments[0].z), high = low;
     for (size_t i = 0; i < n; ++i) {
         const int32_t bits = to_bits(fragments[i].z);
@@ -66,15 +74,16 @@ SF_INLINE void bucket_by_depth(const Fragment* fragments, size_t n, TileScratch&
         high = bits > high ? bits : high;
     }
     int shift = 0;
-    while ((high - low) >> shift >= kBuckets) ++shift;
-    std::fill(begin, begin + kBuckets + 2, 0u);
+    while ((high - low) >> shift >= buckets) ++shift;
+    std::fill(begin, begin + buckets + 2, 0u);
     for (size_t i = 0; i < n; ++i) ++begin[((to_bits(fragments[i].z) - low) >> shift) + 2];
-    for (int b = 2; b < kBuckets + 2; ++b) begin[b] += begin[b - 1];
+    for (int b = 2; b < buckets + 2; ++b) begin[b] += begin[b - 1];
     for (size_t i = 0; i < n; ++i) {
         const uint64_t bits = static_cast<uint64_t>(to_bits(fragments[i].z));
         t.items[begin[((static_cast<int32_t>(bits) - low) >> shift) + 1]++] = {
             bits << 32 | static_cast<uint32_t>(fragments[i].id), t.windows[i], static_cast<uint32_t>(i)};
     }
+    return buckets;
 }
 
 // One fragment into the lists of the pixels it covers; returns how many of them it closes. Free of branches.
@@ -113,9 +122,9 @@ SF_SIMD void fill_lists(const RasterSpec& s, const Fragment* fragments, size_t n
     t.reserve(n);
     unpack(s, fragments, n, left, top, t);
     uint32_t begin[kBuckets + 2];
-    bucket_by_depth(fragments, n, t, begin);
+    const int buckets = bucket_by_depth(fragments, n, t, begin);
     int open = std::min(kTile, s.width - left) * std::min(kTile, s.height - top);
-    for (int b = 0; b < kBuckets && open > 0; ++b) {
+    for (int b = 0; b < buckets && open > 0; ++b) {
         Item *first = t.items.data() + begin[b], *last = t.items.data() + begin[b + 1];
         if (last - first > 24)
             std::sort(first, last);
@@ -129,75 +138,85 @@ struct RowMeans {  // over the first layer of one row of pixels; `weight` is wha
     float weight[kTile], x[kTile], y[kTile], z[kTile];
 };
 
-// Weighted mean of the first layer for a row of the tile; `t.weight` keeps the weights before normalisation.
-SF_SIMD void resolve_row(const RasterSpec& s, int left, int row, int v, TileScratch& t, RowMeans& out) {
-    const int32_t* count = t.count + row * kTile;
-    const float cx = s.cx, cy = s.cy, py = static_cast<float>(v) + 0.5f;
-    const int most = *std::max_element(count, count + kTile);
-    float sum_w[kTile] = {}, sum_x[kTile] = {}, sum_y[kTile] = {}, sum_z[kTile] = {}, px[kTile];
-    for (int i = 0; i < kTile; ++i) px[i] = static_cast<float>(left + i) + 0.5f;
+// Weighted means of the first layer for eight pixels of a row; `t.weight` keeps the weights before normalisation.
+SF_INLINE void resolve8(const RasterSpec& s, float u, float v, int pixel, TileScratch& t, RowMeans& out) {
+    const Int8 count = *reinterpret_cast<const Int8*>(t.count + pixel);
+    const Float8 centre = Float8{0, 1, 2, 3, 4, 5, 6, 7} + u;
+    const bool square = s.fx == s.fy;
+    const int most = *std::max_element(t.count + pixel, t.count + pixel + 8), column = pixel % kTile;
+    Float8 sum_w{}, sum_x{}, sum_y{}, sum_z{};
     for (int c = 0; c < most; ++c) {
-        const uint32_t* list = t.list.data() + c * kPixels + row * kTile;
-        float* weight = t.weight.data() + c * kTile;
-        float u[kTile], w[kTile], z[kTile], y[kTile], ax[kTile], ay[kTile];
-        uint32_t at[kTile];
-        for (int i = 0; i < kTile; ++i) at[i] = c < count[i] ? list[i] : 0;
-        for (int i = 0; i < kTile; ++i) u[i] = t.u[at[i]], y[i] = t.v[at[i]], z[i] = t.z[at[i]];
-        for (int i = 0; i < kTile; ++i) ax[i] = t.per_x2[at[i]], ay[i] = t.per_y2[at[i]];
-        for (int i = 0; i < kTile; ++i) {
-            const float dx = px[i] - u[i], dy = py - y[i];
-            w[i] = c < count[i] ? exp_negative(dx * dx * ax[i] + dy * dy * ay[i]) : 0.0f;
-            sum_w[i] += w[i];
-            sum_z[i] += w[i] * z[i];
-            sum_x[i] += w[i] * (u[i] - cx) * z[i];
-            sum_y[i] += w[i] * (y[i] - cy) * z[i];
+        const Int8 used = count > c;
+        const Int8 rows = 4 * *reinterpret_cast<const Int8*>(t.list.data() + c * kPixels + pixel) & used;
+        Float8 splat[4];  // u, v, z, -1 / (sigma * half-width^2)
+        gather8x4(t.splats.data(), rows, splat);
+        const Float8 z = splat[2];
+        Float8 per_y2 = splat[3];
+        if (!square) {
+            Float8 half = s.radius * s.fy / z;
+            half = half > 0.5f ? half : Float8{} + 0.5f;
+            half = half < s.max_half ? half : Float8{} + s.max_half;
+            per_y2 = -1.0f / (s.sigma * half * half);
         }
-        std::memcpy(weight, w, sizeof(w));
+        const Float8 dx = centre - splat[0], dy = v - splat[1];
+        const Float8 gauss = exp_negative(dx * dx * splat[3] + dy * dy * per_y2);
+        const Float8 w = used ? gauss : Float8{};
+        std::memcpy(t.weight.data() + c * kTile + column, &w, sizeof(w));
+        const Float8 wz = w * z;
+        sum_w += w;
+        sum_z += wz;
+        sum_x += wz * (splat[0] - s.cx);
+        sum_y += wz * (splat[1] - s.cy);
     }
-    for (int i = 0; i < kTile; ++i) {
-        const float scale = count[i] > 0 ? 1.0f / sum_w[i] : kHole;
-        out.x[i] = sum_x[i] * (scale / s.fx), out.y[i] = sum_y[i] * (scale / s.fy);
-        out.z[i] = sum_z[i] * scale, out.weight[i] = scale;
-    }
+    const Float8 scale = count > 0 ? 1.0f / sum_w : Float8{} + kHole;
+    const Float8 means[4] = {sum_x * scale / s.fx, sum_y * scale / s.fy, sum_z * scale, scale};
+    std::memcpy(out.x + column, &means[0], 32), std::memcpy(out.y + column, &means[1], 32);
+    std::memcpy(out.z + column, &means[2], 32), std::memcpy(out.weight + column, &means[3], 32);
+}
+
+SF_SIMD void resolve_row(const RasterSpec& spec, int left, int row, int v, TileScratch& t, RowMeans& out) {
+    const RasterSpec s = spec;
+    for (int i = 0; i < kTile; i += 8)
+        resolve8(s, static_cast<float>(left + i) + 0.5f, static_cast<float>(v) + 0.5f, row * kTile + i, t, out);
 }
 
 // Mean of the points' normals, each turned towards the camera.
-void blend_normals(const RasterSpec& s, const float* normals, const int32_t* index, const float* weight, int count,
-                   const float* position, float* out) {
+void blend_normals(const RasterSpec& s, const float* normals, const Fragment* fragments, const TileScratch& t,
+                   int pixel, const float* position, float* out) {
     const float* R = s.rotation;
-    float sum[3] = {0.0f, 0.0f, 0.0f};
-    for (int c = 0; c < count; ++c) {
-        const float* n = normals + 3 * static_cast<size_t>(index[c]);
+    float sum[3] = {0.0f, 0.0f, 0.0f}, total = 0.0f;
+    for (int c = 0; c < t.count[pixel]; ++c) {
+        const float* n = normals + 3 * static_cast<size_t>(fragments[t.list[c * kPixels + pixel]].id);
+        const float weight = t.weight[c * kTile + pixel % kTile];
+        total += weight;
         float m[3];
         for (int a = 0; a < 3; ++a) m[a] = R[3 * a] * n[0] + R[3 * a + 1] * n[1] + R[3 * a + 2] * n[2];
         const float towards = m[0] * position[0] + m[1] * position[1] + m[2] * position[2] > 0.0f ? -1.0f : 1.0f;
-        for (int a = 0; a < 3; ++a) sum[a] += towards * weight[c] * m[a];
+        for (int a = 0; a < 3; ++a) sum[a] += towards * weight * m[a];
     }
-    const float norm = std::sqrt(sum[0] * sum[0] + sum[1] * sum[1] + sum[2] * sum[2]);
-    for (int a = 0; a < 3; ++a) out[a] = norm > 1e-6f ? sum[a] / norm : kHole;
+    const float norm = norm_of(sum);
+    for (int a = 0; a < 3; ++a) out[a] = norm > 1e-6f * total && total > 0.0f ? sum[a] / norm : kHole;
 }
 
 void write_row(const RasterSpec& s, const float* normals, const Fragment* fragments, int row, size_t at, int width,
-               const TileScratch& t, const RowMeans& sums, const RasterImages& out) {
-    std::copy(sums.z, sums.z + width, out.depth + at);
+               const TileScratch& t, const RowMeans& means, const RasterImages& out) {
+    std::copy(means.z, means.z + width, out.depth + at);
     for (int i = 0; i < width && out.position; ++i) {
         float* p = out.position + 3 * (at + i);
-        p[0] = sums.x[i], p[1] = sums.y[i], p[2] = sums.z[i];
+        p[0] = means.x[i], p[1] = means.y[i], p[2] = means.z[i];
     }
-    if (!out.index && !out.weight && !(out.normal && normals)) return;
-    std::vector<int32_t> ids(s.k_ray);
-    std::vector<float> weights(s.k_ray);
-    for (int i = 0; i < width; ++i) {
-        const int count = t.count[row * kTile + i];
-        for (int c = 0; c < s.k_ray; ++c) {
-            ids[c] = c < count ? fragments[t.list[c * kPixels + row * kTile + i]].id : -1;
-            weights[c] = c < count ? t.weight[c * kTile + i] * sums.weight[i] : 0.0f;
-        }
-        if (out.index) std::copy(ids.begin(), ids.end(), out.index + (at + i) * s.k_ray);
-        if (out.weight) std::copy(weights.begin(), weights.end(), out.weight + (at + i) * s.k_ray);
-        if (!out.normal || !normals) continue;
-        const float position[3] = {sums.x[i], sums.y[i], sums.z[i]};
-        blend_normals(s, normals, ids.data(), weights.data(), count, position, out.normal + 3 * (at + i));
+    const size_t k = s.k_ray;
+    for (int i = 0; i < width && (out.index || out.weight); ++i) {
+        const size_t count = t.count[row * kTile + i];
+        const uint32_t* list = t.list.data() + row * kTile + i;
+        for (size_t c = 0; c < k && out.index; ++c)
+            out.index[(at + i) * k + c] = c < count ? fragments[list[c * kPixels]].id : -1;
+        for (size_t c = 0; c < k && out.weight; ++c)
+            out.weight[(at + i) * k + c] = c < count ? t.weight[c * kTile + i] * means.weight[i] : 0.0f;
+    }
+    for (int i = 0; i < width && out.normal && normals; ++i) {
+        const float position[3] = {means.x[i], means.y[i], means.z[i]};
+        blend_normals(s, normals, fragments, t, row * kTile + i, position, out.normal + 3 * (at + i));
     }
 }
 
@@ -251,9 +270,11 @@ void normals_of(const float* position, int width, int height, float layer_gap, i
             const float *a = same_layer(u, v - 1), *b = same_layer(u, v + 1);
             const float x[3] = {r[0] - l[0], r[1] - l[1], r[2] - l[2]}, y[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
             float n[3] = {y[1] * x[2] - y[2] * x[1], y[2] * x[0] - y[0] * x[2], y[0] * x[1] - y[1] * x[0]};
-            const float norm = std::sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
+            const float norm = norm_of(n);
+            const float across = norm_of(x), down = norm_of(y);
+            const bool sound = std::min(across, down) > kMinStep * p[2] && norm > kMinSine * across * down;
             float* out = normal + 3 * (static_cast<size_t>(v) * width + u);
-            for (int c = 0; c < 3; ++c) out[c] = norm > 0.0f ? n[c] / norm : kHole;
+            for (int c = 0; c < 3; ++c) out[c] = sound ? n[c] / norm : kHole;
         }
 }
 

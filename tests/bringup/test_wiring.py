@@ -63,8 +63,8 @@ def test_configuration_sections_become_parameters() -> None:
 
 
 def test_lines_that_cannot_run_are_refused() -> None:
-    with pytest.raises(PlanError, match="depth:slam"):
-        line({Q.IMAGE, Q.INTRINSICS}, {})
+    with pytest.raises(PlanError, match="an image set is estimated at once"):
+        line({Q.IMAGE, Q.INTRINSICS}, {}, "mvd")
     with pytest.raises(PlanError, match="in one process"):
         line({Q.IMAGE, Q.INTRINSICS, Q.SPARSE_DEPTH}, {"lidar": "/points"}, "completion")
 

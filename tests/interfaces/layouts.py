@@ -108,6 +108,7 @@ def icl(root: Path, n: int) -> Path:
     for i in range(n):
         picture(root / f"rgb/{i}.png", i, (640, 480))
         depth(root / f"depth/{i}.png", 5000, (640, 480))
+    text(root / "associations.txt", "".join(f"{i} depth/{i}.png {i} rgb/{i}.png\n" for i in range(n)))
     text(root / "traj0.gt.freiburg", "".join(tum_line(str(i), mirror @ pose(i) @ mirror) for i in range(n)))
     return root
 

@@ -173,7 +173,7 @@ def test_other_bad_files_are_named_or_left_out(
         (layouts.replica, "../cam_params.json", "{}", "cam_params.json"),
         (layouts.replica, "traj.txt", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1", "1 poses for 3 frames"),
         (layouts.scannet, "intrinsic/intrinsic_depth.txt", "1 2", "intrinsic_depth.txt"),
-        (layouts.tum, "depth.txt", "1.0", "depth.txt:1"),
+        (layouts.tum, "depth.txt", "1.0", "depth.txt must hold"),
         (layouts.kitti_odometry, "calib.txt", "P2: 1 2 3", "P2 of 12 numbers"),
         (layouts.kitti_odometry, "times.txt", "0", "3 images but 1 times"),
         (layouts.kitti_raw, "../calib_velo_to_cam.txt", "", "calib_velo_to_cam.txt"),
@@ -211,6 +211,9 @@ def test_tum_depth_keeps_its_stamp_and_lens_its_distortion(tmp_path: Path) -> No
     path = layouts.tum(tmp_path / "set", 2)
     bag, _ = convert(path, tmp_path / "out.mcap")
     assert stamps(bag, COLOR)[0] == 100_123_456_000 and stamps(bag, DEPTH)[0] == 100_133_456_000
+    (path / "associations.txt").write_text("101.1 depth/1.png 101.2 rgb/1.png\n")
+    bag, _ = convert(path, tmp_path / "out.mcap")
+    assert stamps(bag, COLOR) == [101_200_000_000] and stamps(bag, DEPTH) == [101_100_000_000]
     other = path.with_name("rgbd_dataset_freiburg1_test")
     path.rename(other)
     bag, _ = convert(other, tmp_path / "out.mcap")
@@ -301,6 +304,7 @@ def test_what_is_no_data_set_is_told_what_it_is(tmp_path: Path) -> None:
     with pytest.raises(FormatError, match="seq-01"):
         recognise(tmp_path / "scene")
     (tmp_path / "scene" / "run.mcap").touch()
+    layouts.picture(tmp_path / "scene" / "plot.png", 0)
     with pytest.raises(FormatError, match=r"bags.*run\.mcap"):
         recognise(tmp_path / "scene")
 

@@ -31,7 +31,7 @@ def surface(n: int, seed: int = 0) -> np.ndarray:
     return np.column_stack([xy, 2 + 0.3 * np.sin(4 * xy[:, 0])]).astype(np.float32)
 
 
-def make_field(features: int = 8, colour_base: bool = False) -> ColorField:
+def make_field(features: int = 8, view_directions: bool = False) -> ColorField:
     points = NeuralPoints(0.03, levels=3, multiplier=3.0)
     field = ColorField(
         points,
@@ -39,39 +39,50 @@ def make_field(features: int = 8, colour_base: bool = False) -> ColorField:
         hidden=20,
         neighbours=4,
         sigma=1.0,
-        colour_base=colour_base,
+        view_directions=view_directions,
         threads=0,
         generator=torch.Generator().manual_seed(0),
     )
     cloud = surface(20000)
     field.grow(points.allocate(cloud, 0.5 + 0.4 * np.sin(cloud)))
     generator = torch.Generator().manual_seed(1)
+    torch.nn.init.xavier_uniform_(field.network[-1].weight, generator=generator)
     field.features = [torch.randn(f.shape, generator=generator) for f in field.features]
     return field
 
 
 def levels_of(field: ColorField) -> list[FieldLevel]:
     return [
-        FieldLevel(level._grid, f.numpy(), SEARCH_RADIUS * level.spacing, field.sigma * level.spacing**2)
+        FieldLevel(level.grid, f.numpy(), SEARCH_RADIUS * level.spacing, field.sigma * level.spacing**2)
         for level, f in zip(field.points.levels, field.features, strict=True)
     ]
+
+
+def expected_colors(field: ColorField, queries: np.ndarray, base: np.ndarray | None = None) -> np.ndarray:
+    """The network on interpolated features in torch, without the field's own colour features."""
+    near = field.neighbourhoods(queries)
+    with torch.no_grad():
+        out = field.network(field.encode(near))
+        if base is not None:
+            out = out + torch.logit((torch.from_numpy(base)[near[0].ids] * near[0].weights[..., None]).sum(1), eps=0.02)
+        return torch.sigmoid(out).numpy()
 
 
 def layers_of(network: torch.nn.Sequential) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(m.weight.detach().numpy(), m.bias.detach().numpy()) for m in network if isinstance(m, torch.nn.Linear)]
 
 
-@pytest.mark.parametrize("features", [2, 8, 11])
+@pytest.mark.parametrize("features", [3, 8, 11])
 @pytest.mark.parametrize("colour_base", [False, True])
 def test_decoded_colours_equal_the_torch_field(features: int, colour_base: bool) -> None:
-    field = make_field(features, colour_base)
-    base = field.points.levels[0].colors if colour_base else None
+    field = make_field(features)
+    base = RNG.uniform(size=(len(field.points.levels[0]), 3)).astype(np.float32) if colour_base else None
     network = ColorNetwork(layers_of(field.network), field.neighbours, base=base)
     ordered = surface(1500, seed=5)[np.argsort(surface(1500, seed=5)[:, 0])]
     far = np.array([[5, 5, 5], [0, 0, 2.6]], np.float32)  # without any neighbour, and with some levels only
     for queries in (ordered, surface(1037, seed=6), far, np.zeros((0, 3), np.float32)):
         got = decode_colors(queries, levels_of(field), network)
-        np.testing.assert_allclose(got, field.color(queries), atol=3e-6)
+        np.testing.assert_allclose(got, expected_colors(field, queries, base), atol=3e-6)
 
 
 def test_image_equals_its_points_and_leaves_holes_black() -> None:
@@ -85,7 +96,7 @@ def test_image_equals_its_points_and_leaves_holes_black() -> None:
     got = decode_image(position, T, levels_of(field), network)
     hole = np.isnan(position[..., 0])
     assert not got[hole].any()
-    np.testing.assert_allclose(got[~hole], field.color(position[~hole]), atol=3e-6)
+    np.testing.assert_allclose(got[~hole], expected_colors(field, position[~hole]), atol=3e-6)
     for threads in (1, 3):
         assert got.tobytes() == decode_image(position, T, levels_of(field), network, threads).tobytes()
 
@@ -167,3 +178,14 @@ def test_a_grid_can_be_searched_while_it_grows() -> None:
         assert (ids >= 0).all() and (np.diff(d2, axis=1) >= 0).all()
     writer.join()
     assert len(grid) == 80000
+
+
+@pytest.mark.parametrize("sided", [False, True])
+def test_field_decodes_as_it_trains(sided: bool) -> None:
+    field = make_field(view_directions=sided)
+    queries, eye = surface(500, seed=7), np.array([0.1, -0.2, 0.3])
+    directions = (queries - eye) / np.linalg.norm(queries - eye, axis=1, keepdims=True)
+    near = field.neighbourhoods(queries)
+    with torch.no_grad():
+        trained = field.decode(field.encode(near), near, directions.astype(np.float32)).numpy()
+    np.testing.assert_allclose(field.color(queries, eye), trained, atol=3e-6)

@@ -26,8 +26,8 @@ DATASETS: tuple[type[Dataset], ...] = (
     SevenScenes,
     Replica,
     ScanNet,
-    TumRgbd,
     IclNuim,
+    TumRgbd,
     KittiOdometry,
     KittiRaw,
     KittiStereo,
@@ -53,9 +53,13 @@ def recognise(path: Path, depth_scale: float | None = None) -> Dataset:
     if not path.exists():
         raise FormatError(f"data set {path} does not exist; check the path")
     for kind in DATASETS:
-        if kind.matches(path):
+        if kind.matches(path) and not (kind is Photos and _bags(path)):  # pictures beside a bag are those of a run
             return kind(path, depth_scale)
     raise FormatError(f"{path} {_what_else(path)}")
+
+
+def _bags(path: Path) -> list[str]:
+    return [p.name for p in sorted(path.iterdir()) if is_bag(p)]
 
 
 def _what_else(path: Path) -> str:
@@ -64,11 +68,9 @@ def _what_else(path: Path) -> str:
         if path.suffix.lower() in (".txt", ".tum", ".csv", ".kitti"):
             return "is a text file, no recording: a trajectory is given with --poses (input) or --reference (eval)"
         return "is neither a bag nor a video nor a folder; give a recording"
-    children = sorted(path.iterdir())
-    bags = [p.name for p in children if is_bag(p)]
-    if bags:
+    if bags := _bags(path):
         return f"is a folder with bags; give one of them: {', '.join(bags[:5])}"
-    below = [p.name for p in children if p.is_dir() and any(kind.matches(p) for kind in DATASETS)]
+    below = [p.name for p in sorted(path.iterdir()) if p.is_dir() and any(kind.matches(p) for kind in DATASETS)]
     if below:
         return f"holds several recordings or one below; give one of them: {', '.join(below[:5])}"
     known = ", ".join(kind.name for kind in DATASETS)

@@ -17,7 +17,7 @@ from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.undistort import Distortion
 from sf_interfaces.io.datasets.dataset import OPTICAL, Dataset, Reader, Sample
-from sf_interfaces.io.datasets.files import natural_key, number_of, read_depth, read_rgb
+from sf_interfaces.io.datasets.files import first_existing, natural_key, number_of, read_depth, read_rgb
 from sf_interfaces.io.datasets.indoor import stamp_30hz
 from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.types import Camera, Float64, Trajectory
@@ -27,25 +27,65 @@ _POSE_GAP_NS = 100_000_000  # the motion capture runs at 100 Hz; over a longer g
 _Stamped = tuple[int, Path]
 
 
+def _stamp(word: str) -> int:
+    """Seconds as text -> ns, exactly (decimal, not float)."""
+    return int((Decimal(word) * 10**9).to_integral_value())
+
+
+def _rows(path: Path, columns: int, form: str) -> list[list[str]]:
+    try:
+        lines = [line.split() for line in path.read_text().splitlines()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise FormatError(f"cannot read {path} ({error}); copy the data set again") from error
+    rows = [words for words in lines if words and not words[0].startswith("#")]
+    for words in rows:
+        if len(words) != columns:
+            raise FormatError(f"{path} must hold '{form}' in each line, not '{' '.join(words)}'; mend that line")
+    if not rows:
+        raise FormatError(f"{path} lists no file; copy the data set again")
+    return rows
+
+
 def read_file_list(path: Path) -> list[_Stamped]:
-    """rgb.txt or depth.txt: (stamp ns, file) in time order; stamps are read exactly (decimal, not float).
+    """rgb.txt or depth.txt: (stamp ns, file) in the order of time.
 
     Raises:
         FormatError: unreadable, no line, or a line that is not "stamp file".
     """
-    entries = {}
     try:
-        for number, line in enumerate(path.read_text().splitlines(), 1):
-            words = line.split()
-            if words and not words[0].startswith("#"):
-                if len(words) != 2:
-                    raise FormatError(f"{path}:{number} must be 'stamp file', not '{line.strip()}'; mend that line")
-                entries[int((Decimal(words[0]) * 10**9).to_integral_value())] = path.parent / words[1]
-    except (OSError, InvalidOperation, UnicodeDecodeError) as error:
-        raise FormatError(f"cannot read the file list {path} ({error!r}); copy the data set again") from error
-    if not entries:
-        raise FormatError(f"{path} lists no file; copy the data set again")
-    return sorted(entries.items())
+        return sorted({_stamp(stamp): path.parent / name for stamp, name in _rows(path, 2, "stamp file")}.items())
+    except InvalidOperation as error:
+        raise FormatError(f"{path} holds a stamp that is no number; mend that line") from error
+
+
+def read_associations(path: Path) -> list[tuple[_Stamped, _Stamped]]:
+    """associations.txt: pairs of colour and depth, in either order of columns, in the order of time.
+
+    Raises:
+        FormatError: unreadable, no line, or a line that is not "stamp file stamp file".
+    """
+    pairs = {}
+    try:
+        for words in _rows(path, 4, "stamp file stamp file"):
+            first, second = ((_stamp(words[k]), path.parent / words[k + 1]) for k in (0, 2))
+            color, depth = (second, first) if "depth" in words[1] else (first, second)
+            pairs[color[0]] = (color, depth)
+    except InvalidOperation as error:
+        raise FormatError(f"{path} holds a stamp that is no number; mend that line") from error
+    return [pairs[stamp] for stamp in sorted(pairs)]
+
+
+def associate(colors: list[_Stamped], depths: list[_Stamped]) -> list[tuple[_Stamped, _Stamped | None]]:
+    """Each image with the depth nearest in time, within 20 ms; a depth image goes to one image only."""
+    stamps = np.array([stamp for stamp, _ in depths])
+    pairs: list[tuple[_Stamped, _Stamped | None]] = []
+    taken = -1
+    for color in colors:
+        match = _nearest(color[0], stamps, _ASSOCIATION_NS)
+        free = match is not None and match > taken
+        pairs.append((color, depths[match] if match is not None and free else None))
+        taken = taken if match is None else max(taken, match)
+    return pairs
 
 
 def _nearest(stamp: int, stamps: np.ndarray, within_ns: int) -> int | None:
@@ -74,12 +114,12 @@ def pose_at(trajectory: Trajectory, stamp: int, gap_ns: int) -> Float64 | None:
 class TumRgbd(Dataset):
     """TUM RGB-D benchmark. Its folders hold no calibration: the published one is taken by freiburg1..3 in the path.
 
-    Each image gets the depth nearest in time (20 ms), which keeps its own stamp; depth is registered to the
-    distorted colour image. Poses of groundtruth.txt are interpolated at the image's time.
+    Each image gets the depth of associations.txt, else the nearest in time (20 ms); it keeps its own stamp. Depth
+    is registered to the distorted colour image. Poses of groundtruth.txt are interpolated at the image's time.
     """
 
     name: ClassVar[str] = "TUM RGB-D"
-    evidence: ClassVar[str] = "rgb.txt, depth.txt; groundtruth.txt where there is one"
+    evidence: ClassVar[str] = "rgb.txt and depth.txt, or associations.txt; groundtruth.txt where there is one"
     depth_units: ClassVar[float | None] = 5000.0
     depth_encoding: ClassVar[str] = "32FC1"
 
@@ -91,15 +131,23 @@ class TumRgbd(Dataset):
     }
 
     @staticmethod
+    def _associations(path: Path) -> Path | None:
+        return first_existing(path / f"{name}.txt" for name in ("associations", "associated", "associate"))
+
+    @staticmethod
     def matches(path: Path) -> bool:
-        return (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+        lists = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+        return lists or TumRgbd._associations(path) is not None
 
     @cached_property
-    def _images(self) -> list[_Stamped]:
-        return read_file_list(self.path / "rgb.txt")
+    def _pairs(self) -> Sequence[tuple[_Stamped, _Stamped | None]]:
+        given = self._associations(self.path)
+        if given is not None:
+            return read_associations(given)
+        return associate(*(read_file_list(self.path / name) for name in ("rgb.txt", "depth.txt")))
 
     def __len__(self) -> int:
-        return len(self._images)
+        return len(self._pairs)
 
     def _calibration(self) -> tuple[Camera | None, Distortion | None]:
         found = re.search(r"freiburg([123])", str(self.path.resolve()))
@@ -109,16 +157,10 @@ class TumRgbd(Dataset):
         return Camera(640, 480, fx, fy, cx + 0.5, cy + 0.5, OPTICAL), Distortion("plumb_bob", tuple(lens))
 
     def samples(self) -> Iterator[Reader]:
-        depths = read_file_list(self.path / "depth.txt")
-        stamps = np.array([stamp for stamp, _ in depths])
         truth = self.path / "groundtruth.txt"
         trajectory = read_tum(truth) if truth.is_file() else None
         calibration = self._calibration()
-        taken = -1
-        for stamp, file in self._images:
-            match = _nearest(stamp, stamps, _ASSOCIATION_NS)
-            depth = None if match is None or match <= taken else depths[match]
-            taken = taken if match is None else max(taken, match)
+        for (stamp, file), depth in self._pairs:
             pose = None if trajectory is None else pose_at(trajectory, stamp, _POSE_GAP_NS)
             yield partial(self._sample, stamp, file, depth, pose, *calibration)
 

@@ -1,0 +1,276 @@
+"""U2-MVD: depth of a reference image from others, unposed and uncalibrated if need be (paper Sec. V).
+
+    match -> cross check -> start -> [static, parallax, epipole check <-> dense BA] -> match again -> depth
+
+:meth:`MultiViewDepth.recover` is the loop. Without given poses its unit of length is the median depth; see
+:mod:`sf_depth.core.scale` for the way to the global scale.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sf_depth.config import DepthConfig
+from sf_depth.core import checks, dense_ba, dense_depth, pinhole
+from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
+from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
+from sf_depth.core.outliers import lonely
+from sf_depth.core.scale import from_translations
+from sf_depth.core.start import Size, start, triangulate
+from sf_interfaces.errors import FormatError, InsufficientParallax
+from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Scale, UInt8
+
+_LEAST_CONTRAST = 2.0  # grey levels; below it an image is blank
+_CHECK_ROUNDS = 2  # the checks and dense BA improve each other
+_NOISY_POSES = 1.5  # given poses that leave so many times the residual of free ones are refined
+_REGISTERED = 60  # strided correspondences a source keeps if it is registered
+_LEAST_DENSITY = 0.01  # share of the reference's pixels that has to be triangulated
+
+
+@dataclass(frozen=True, slots=True)
+class Recovered:
+    """What a set of views says about its reference.
+
+    Args:
+        depth: depth and variance of the reference, NaN where nothing was triangulated.
+        camera: intrinsics, as given or as estimated.
+        T_source_reference: [S, 4, 4], in the unit of the depth.
+        registered: which sources keep enough correspondences, [S].
+        focal_sigma: posterior deviation of the focal length relative to it; 0 where it was given.
+        sigma: deviation of a correspondence, px.
+        distortion: radial term k1 of the images, 0 unless it was estimated.
+    """
+
+    depth: DepthMap
+    camera: Camera
+    T_source_reference: Float64
+    registered: np.ndarray
+    focal_sigma: float
+    sigma: float
+    distortion: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Matched:
+    """Cross-checked correspondences: target [S, H, W, 2] px and weight [S, H, W]; ``seen`` is every n-th of them."""
+
+    target: Float32
+    weight: Float32
+    seen: Observations
+    grid: tuple[int, int]  # rows and columns of ``seen``
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """The optimum of dense BA and the observations that passed the checks on the way."""
+
+    adjusted: Adjusted
+    seen: Observations
+
+
+class MultiViewDepth:
+    """Recovers the depth of one image from others; holds no geometry between calls.
+
+    Args:
+        config: see :class:`DepthConfig`.
+        matcher: replaces the one the configuration names.
+    """
+
+    def __init__(self, config: DepthConfig, matcher: Matcher | None = None) -> None:
+        self._config = config
+        self._matcher = matcher or load_matcher(config.matcher)
+
+    def recover(
+        self,
+        reference: UInt8,
+        sources: Sequence[UInt8],
+        camera: Camera | None = None,
+        T_source_reference: Float64 | None = None,
+    ) -> Recovered:
+        """Depth of ``reference``, and whatever of intrinsics and poses is not given.
+
+        Args:
+            reference, sources: images of one size, taken by one camera.
+            camera: intrinsics, or None to estimate those that option ``intrinsics`` names.
+            T_source_reference: [S, 4, 4]; the depth then has their scale. Needs ``camera``.
+
+        Raises:
+            FormatError: fewer than two images, images of different size, or a blank one.
+            InsufficientParallax: the views do not constrain depth.
+        """
+        check_images([reference, *sources])
+        T = T_source_reference
+        size = Size(reference.shape[1], reference.shape[0])
+        theta = None if camera is None else pinhole.theta_of(camera)
+        free = self._config.intrinsics if camera is None else "none"
+
+        matched = self._match(reference, sources)
+        posed = theta is not None and T is not None
+        at = _triangulated(matched.seen, theta, T) if theta is not None and T is not None else None
+        fit = self._check_and_adjust(matched.seen, at or start(matched.seen, size, theta), size, not posed, free)
+        for _ in range(self._config.rematches):
+            matched = self._match(reference, sources, _expected(fit, matched.grid, size))
+            at = fit.adjusted.estimate
+            at = _triangulated(matched.seen, at.theta, at.T)
+            fit = self._check_and_adjust(matched.seen, at, size, not posed, free)
+        if posed:
+            fit = self._refine_noisy_poses(matched.seen, fit, size)
+        depth = _dense(matched, fit, size)
+        return _recovered(depth, fit, size, camera, Scale.METRIC if posed else Scale.ARBITRARY)
+
+    def _match(
+        self, reference: UInt8, sources: Sequence[UInt8], guess: Sequence[Float32 | None] | None = None
+    ) -> _Matched:
+        """Correspondences to every source that come back to where they started."""
+        guesses = guess if guess is not None else [None] * len(sources)
+        found = [self._matcher(reference, image, expected) for image, expected in zip(sources, guesses, strict=True)]
+        weight = np.stack([checks.cross_check(one) for one in found])
+        target = np.where(weight[..., None] > 0, np.stack([one.target for one in found]), np.float32(0))
+        return _Matched(target, weight, *_strided(target, weight, self._config.stride))
+
+    def _check_and_adjust(self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str) -> _Fit:
+        """Dense BA over what passes the checks; both run again with the better geometry.
+
+        Raises:
+            InsufficientParallax: next to nothing passes.
+        """
+        for _ in range(_CHECK_ROUNDS):
+            weight = checks.checked(seen.weight, seen.uv, seen.target, at, size.width)
+            if (weight > 0).any(axis=0).sum() < _REGISTERED:
+                raise InsufficientParallax(
+                    "hardly a pixel of the images can be triangulated: they move too little, or not as one rigid "
+                    "scene; give views that are a tenth of the distance to the scene apart"
+                )
+            good = Observations(seen.uv, seen.target, weight)
+            adjusted = dense_ba.adjust(good, at, poses=poses, intrinsics=intrinsics)
+            at = adjusted.estimate
+        return _Fit(adjusted, good)
+
+    def _refine_noisy_poses(self, seen: Observations, fit: _Fit, size: Size) -> _Fit:
+        """Given poses that fit the images badly are refined and only keep their scale."""
+        given = fit.adjusted.estimate
+        free = self._check_and_adjust(seen, given, size, True, "none")
+        if fit.adjusted.sigma < _NOISY_POSES * free.adjusted.sigma:
+            return fit
+        at = free.adjusted.estimate
+        scaled = dense_ba.rescaled(at, from_translations(at.T[:, :3, 3], given.T[:, :3, 3]))
+        return _Fit(dense_ba.adjust(free.seen, scaled, poses=False), free.seen)
+
+
+def check_images(images: Sequence[UInt8]) -> None:
+    """Refuse what no depth can come from.
+
+    Raises:
+        FormatError: fewer than two images, images of different size, or a blank one.
+    """
+    if len(images) < 2:
+        raise FormatError(f"multi-view depth needs at least 2 images, got {len(images)}")
+    sizes = {image.shape[:2] for image in images}
+    if len(sizes) > 1:
+        named = ", ".join(f"{w}x{h}" for h, w in sorted(sizes))
+        raise FormatError(f"the images differ in size ({named}); give images of one camera, all of one size")
+    for index, image in enumerate(images):
+        if image.std() < _LEAST_CONTRAST:
+            raise FormatError(f"image {index} is blank (contrast {image.std():.1f} grey levels); leave it out")
+
+
+def _triangulated(seen: Observations, theta: Float64, T: Float64) -> Estimate:
+    """Known poses and intrinsics with the inverse depths that follow from them."""
+    return Estimate(theta, T, triangulate(seen, Estimate(theta, T, np.ones(seen.uv.shape[1]))))
+
+
+def _strided(target: Float32, weight: Float32, stride: int) -> tuple[Observations, tuple[int, int]]:
+    """Every n-th pixel of both axes as observations, and the size of that grid."""
+    every = (slice(stride // 2, None, stride),) * 2
+    uv = pixel_grid(weight.shape[1:])[every]
+    count = len(weight)
+    columns = target[:, every[0], every[1]].reshape(count, -1, 2).transpose(0, 2, 1).astype(np.float64)
+    seen = Observations(
+        np.ascontiguousarray(uv.reshape(-1, 2).T, dtype=np.float64),
+        np.ascontiguousarray(columns),
+        weight[:, every[0], every[1]].reshape(count, -1).astype(np.float64),
+    )
+    return seen, uv.shape[:2]
+
+
+def _expected(fit: _Fit, grid: tuple[int, int], size: Size) -> list[Float32 | None]:
+    """Where the geometry known by now puts every reference pixel in each source; None for a lost source."""
+    at = fit.adjusted.estimate
+    confidence = (fit.seen.weight > 0).sum(axis=0) * at.inverse_depth**2
+    confidence /= fit.adjusted.inverse_depth_variance + 1e-6 * at.inverse_depth**2
+    d = _filled(at.inverse_depth.reshape(grid), np.minimum(confidence, 1e4).reshape(grid) / 1e4)
+    d = cv2.resize(d, (size.width, size.height), interpolation=cv2.INTER_LINEAR).reshape(-1)
+    x = pinhole.rays(at.theta, pixel_grid((size.height, size.width)).reshape(-1, 2).T.astype(np.float64))
+    known = registered(fit.seen)
+    out: list[Float32 | None] = []
+    for j, T in enumerate(at.T):
+        if not known[j]:
+            out.append(None)
+            continue
+        X = T[:3, :2] @ x + T[:3, 2:3] + T[:3, 3:] * d
+        uv = pinhole.project(at.theta, X[:2] / np.maximum(X[2], 0.05))
+        uv = np.clip(uv, -size.width, 2 * size.width)
+        out.append(uv.T.reshape(size.height, size.width, 2).astype(np.float32))
+    return out
+
+
+def _filled(values: Float64, confidence: Float64) -> Float32:
+    """An image without gaps: at every scale the finest level that knows something wins."""
+    levels = [((values * confidence).astype(np.float32), confidence.astype(np.float32))]
+    while min(levels[-1][0].shape) > 2:
+        levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))
+    top, bottom = levels.pop()
+    out = top / np.maximum(bottom, 1e-9)
+    while levels:
+        top, bottom = levels.pop()
+        coarse = cv2.resize(out, top.shape[::-1], interpolation=cv2.INTER_LINEAR)
+        share = np.minimum(bottom, 1.0)
+        out = np.where(bottom > 1e-6, top / np.maximum(bottom, 1e-9), 0.0) * share + (1.0 - share) * coarse
+    return np.asarray(np.maximum(out, 1e-3 * float(np.median(values))), dtype=np.float32)
+
+
+def _dense(matched: _Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
+    """Inverse depth of every pixel whose correspondences pass the checks."""
+    at, sigma = fit.adjusted.estimate, fit.adjusted.sigma
+    uv = pixel_grid((size.height, size.width)).reshape(-1, 2).T.astype(np.float64)
+    flat = matched.weight.reshape(len(at.T), -1)
+    targets = matched.target.reshape(len(at.T), -1, 2).transpose(0, 2, 1)
+    weight = checks.checked(flat, uv, targets, at, size.width).reshape(matched.weight.shape)
+    solved = dense_depth.solve(at, matched.target, weight, sigma)
+    common = dense_depth.common_variance(fit.adjusted, fit.seen, matched.grid, (size.height, size.width))
+    d = np.where(lonely(solved.d), np.float32(np.nan), solved.d)
+    return dense_depth.InverseDepth(d, solved.variance + common, solved.support)
+
+
+def registered(seen: Observations) -> np.ndarray:
+    """Which sources keep enough correspondences to be placed, [S]."""
+    return np.asarray((seen.weight > 0).sum(axis=1) >= _REGISTERED)
+
+
+def _recovered(
+    solved: dense_depth.InverseDepth, fit: _Fit, size: Size, camera: Camera | None, scale: Scale
+) -> Recovered:
+    """Depth with variance in the unit of the poses.
+
+    Raises:
+        InsufficientParallax: next to no pixel has a depth.
+    """
+    adjusted = fit.adjusted
+    at = adjusted.estimate
+    z = 1.0 / solved.d
+    density = float(np.isfinite(z).mean())
+    if density < _LEAST_DENSITY:
+        raise InsufficientParallax(
+            f"only {density:.1%} of the pixels can be triangulated; give views with more parallax and more overlap"
+        )
+    variance = np.where(np.isfinite(z), z**4 * solved.variance, np.nan)
+    own = camera or pinhole.camera_of(at.theta, size.width, size.height)
+    focal_sigma = 0.0 if camera is not None else float(np.sqrt(adjusted.covariance[6 * len(at.T), 6 * len(at.T)]))
+    return Recovered(
+        DepthMap(z, variance, scale), own, at.T, registered(fit.seen), focal_sigma, adjusted.sigma, float(at.theta[4])
+    )

@@ -1,0 +1,64 @@
+"""Scale of a depth map that was recovered without poses (paper Sec. Recover Scale to Global).
+
+Either the tracker's landmarks or given translations hold the global scale. Both are robust: one wrong landmark
+or one wrong pose does not move it. Every threshold is relative, so there is no limit on distance.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+
+from sf_interfaces.errors import InsufficientParallax
+from sf_interfaces.types import Camera, Float32, Float64
+
+_TOLERANCE = 0.05  # relative difference of an inlier
+_LEAST_LANDMARKS = 8
+_LEAST_SHARE = 0.3  # of the landmarks that have to agree
+
+
+def consensus(ratios: Float64) -> tuple[float, np.ndarray]:
+    """The scale most ratios agree on, and which do: RANSAC with every ratio as a hypothesis, then their median."""
+    logs = np.log(ratios)
+    near = np.abs(logs[None] - logs[:, None]) < _TOLERANCE
+    best = int(near.sum(axis=1).argmax())
+    return float(np.exp(np.median(logs[near[best]]))), near[best]
+
+
+def from_landmarks(z: Float32, landmarks: Float64, camera: Camera) -> float:
+    """Factor that brings depth z [H, W] to the unit of landmarks [N, 3] in the optical frame.
+
+    Raises:
+        InsufficientParallax: too few landmarks fall on estimated depth, or they do not agree.
+    """
+    uv, depth = camera.project(landmarks)
+    height, width = z.shape
+    col, row = np.floor(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64).T
+    inside = (depth > 0) & (col >= 0) & (col < width) & (row >= 0) & (row < height)
+    own = z[row[inside], col[inside]]
+    ratios = (depth[inside] / own)[np.isfinite(own) & (own > 0)]
+    if len(ratios) < _LEAST_LANDMARKS:
+        raise InsufficientParallax(
+            f"only {len(ratios)} landmarks fall on estimated depth, the scale needs {_LEAST_LANDMARKS}; "
+            "move slower or into a scene with more texture"
+        )
+    scale, inlier = consensus(ratios)
+    if inlier.mean() < _LEAST_SHARE:
+        raise InsufficientParallax(
+            f"{inlier.mean():.0%} of {len(ratios)} landmarks agree on a scale, {_LEAST_SHARE:.0%} are needed"
+        )
+    return scale
+
+
+def from_translations(estimated: Float64, given: Float64) -> float:
+    """Factor that brings estimated translations [S, 3] to given ones; those without motion do not count.
+
+    Raises:
+        InsufficientParallax: no translation to compare.
+    """
+    own, true = np.linalg.norm(estimated, axis=1), np.linalg.norm(given, axis=1)
+    moving = (own > 1e-9) & (true > 0.1 * true.max(initial=0.0)) & (true > 0)
+    if not moving.any():
+        raise InsufficientParallax("the given poses have no baseline, so the scale of the depth stays unknown")
+    scale, _ = consensus(true[moving] / own[moving])
+    return scale

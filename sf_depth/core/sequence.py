@@ -1,0 +1,186 @@
+"""Depth of the keyframes of a sequence (modes ``slam`` and ``posed``).
+
+A keyframe waits until frames after it have come too; then its good neighbours are chosen, U2-MVD runs on them,
+and the tracker's landmarks (slam) or the given poses (posed) bring its depth to the global scale.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from sf_depth.config import DepthConfig
+from sf_depth.core.estimator import DepthCompleter
+from sf_depth.core.mvd import MultiViewDepth
+from sf_depth.core.neighbors import NeighborLimits, before_and_after
+from sf_depth.core.overlap import sighted_depth
+from sf_depth.core.scale import from_landmarks, from_translations
+from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.geometry import se3
+from sf_interfaces.types import DepthMap, Float64, Keyframe
+
+_AHEAD = 6  # later frames a keyframe waits for
+_KEPT = 24  # frames that may still become neighbours
+_LEAST_NEIGHBORS = 2  # tau_nb of the paper
+
+
+class Setting(Protocol):
+    """What tells the two modes apart."""
+
+    def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
+        """Whether a frame becomes a reference; ``last`` was one, the scene is ``depth`` away."""
+
+    def scene_depth(self, frame: Keyframe, others: list[Keyframe]) -> float | None:
+        """Typical depth that a frame sees, in the unit of its pose; None while unknown."""
+
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> DepthMap:
+        """Depth at the global scale.
+
+        Raises:
+            InsufficientParallax: the neighbours do not constrain it.
+        """
+
+
+def _relative(frame: Keyframe, sources: list[Keyframe]) -> Float64:
+    """T_source_reference [S, 4, 4] by the poses of the keyframes."""
+    return np.stack([se3.inverse(source.T_map_camera) @ frame.T_map_camera for source in sources])
+
+
+@dataclass(frozen=True, slots=True)
+class SlamSetting:
+    """Every keyframe of the tracker gets depth; poses only choose neighbours, landmarks give the scale."""
+
+    def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
+        """Always: the tracker has chosen."""
+        return True
+
+    def scene_depth(self, frame: Keyframe, others: list[Keyframe]) -> float | None:
+        """Median depth of its landmarks."""
+        if frame.landmarks is None or not len(frame.landmarks):
+            return None
+        z = frame.landmarks.points[:, 2]
+        return float(np.median(z[z > 0])) if (z > 0).any() else None
+
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> DepthMap:
+        """Unposed depth brought to the scale of the landmarks."""
+        got = mvd.recover(frame.image, [s.image for s in sources], frame.camera)
+        assert frame.landmarks is not None
+        scale = from_landmarks(got.depth.z, frame.landmarks.points.astype(np.float64), frame.camera)
+        return scaled(got.depth, scale, frame)
+
+
+@dataclass(frozen=True, slots=True)
+class PosedSetting:
+    """Frames with given poses; those that moved on become references. The poses hold the scale."""
+
+    spacing: float
+
+    def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
+        """It moved or turned enough since the last one."""
+        if last is None:
+            return True
+        T = se3.inverse(last.T_map_camera) @ frame.T_map_camera
+        turned = np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1))
+        return float(np.linalg.norm(T[:3, 3])) / depth + turned > self.spacing
+
+    def scene_depth(self, frame: Keyframe, others: list[Keyframe]) -> float | None:
+        """Median depth of sparse matches, triangulated with the given poses."""
+        return sighted_depth(frame, others)
+
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> DepthMap:
+        """Depth with the given poses; where they fit the images badly, their translations only give the scale."""
+        T = _relative(frame, sources)
+        got = mvd.recover(frame.image, [s.image for s in sources], frame.camera, T)
+        return scaled(got.depth, from_translations(got.T_source_reference[:, :3, 3], T[:, :3, 3]), frame)
+
+
+class EachDepth:
+    """Completes keyframes one by one, as they come (mode ``complete``)."""
+
+    def __init__(self, completer: DepthCompleter) -> None:
+        self._completer = completer
+        self.reasons: dict[str, int] = {}
+
+    def add(self, frame: Keyframe) -> list[Keyframe]:
+        """The keyframe with dense depth."""
+        return [self._completer.complete(frame)]
+
+    def finish(self) -> list[Keyframe]:
+        """Nothing waits."""
+        return []
+
+
+def scaled(depth: DepthMap, scale: float, frame: Keyframe) -> DepthMap:
+    """Depth in the unit of the keyframe's pose."""
+    assert depth.variance is not None
+    return DepthMap(depth.z * scale, depth.variance * scale**2, frame.depth.scale if frame.depth else depth.scale)
+
+
+class SequenceDepth:
+    """Takes the frames of a sequence and gives those that got dense depth.
+
+    Attributes:
+        reasons: why keyframes got no depth, with counts.
+    """
+
+    def __init__(self, config: DepthConfig, setting: Setting) -> None:
+        self._config, self._setting = config, setting
+        self._mvd = MultiViewDepth(config)
+        self._completer = DepthCompleter(config)
+        self._limits = NeighborLimits(config.max_angle, config.min_baseline, config.max_baseline)
+        self._frames: list[Keyframe] = []
+        self._next = 0  # index of the first frame that was not yet considered
+        self._last: Keyframe | None = None
+        self._depth = 0.0
+        self.reasons: dict[str, int] = {}
+
+    def add(self, frame: Keyframe) -> list[Keyframe]:
+        """Take the next frame, whose pose is final; returns the keyframes that have depth now."""
+        self._frames.append(frame)
+        done = []
+        while len(self._frames) - self._next > _AHEAD:
+            done += self._consider()
+        while self._next > _KEPT:
+            del self._frames[0]
+            self._next -= 1
+        return done
+
+    def finish(self) -> list[Keyframe]:
+        """The end of the sequence: the last frames have neighbours on one side only."""
+        done = []
+        while self._next < len(self._frames):
+            done += self._consider()
+        self._frames, self._next, self._last, self._depth = [], 0, None, 0.0
+        return done
+
+    def _consider(self) -> list[Keyframe]:
+        """Depth of the next frame, if it is to be a keyframe and its neighbours allow it."""
+        index, frame = self._next, self._frames[self._next]
+        self._next += 1
+        others = [other for other in self._frames if other is not frame]
+        known = self._setting.scene_depth(frame, others) if self._depth == 0.0 else None
+        self._depth = self._depth or known or 0.0
+        if self._depth == 0.0:
+            return self._skip("the depth of the scene is not known yet: too little parallax")
+        if not self._setting.wants(frame, self._last, self._depth):
+            return []
+        self._depth = self._setting.scene_depth(frame, others) or self._depth
+        poses = [other.T_map_camera for other in self._frames]
+        chosen = before_and_after(index, poses, self._depth, self._limits, self._config.max_sources)
+        if len(chosen) < _LEAST_NEIGHBORS:
+            return self._skip("too few good neighbours: the camera hardly moves, or turns too fast")
+        try:
+            depth = self._setting.recover(self._mvd, frame, [self._frames[j] for j in chosen])
+            dense = self._completer.complete(replace(frame, depth=depth))
+        except SceneFactoryError as error:
+            return self._skip(str(error))
+        self._last = frame
+        return [dense]
+
+    def _skip(self, reason: str) -> list[Keyframe]:
+        words = f"keyframe without depth: {reason}"
+        self.reasons[words] = self.reasons.get(words, 0) + 1
+        return []
