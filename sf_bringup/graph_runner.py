@@ -58,7 +58,8 @@ class _Watch:
             (topics.KEYFRAME_INFO, self._keyframe),
             (topics.DIAGNOSTICS, self._diagnostics),
         ):
-            node.create_subscription(make(topic.type), topic.name, take, qos_profile(topic.qos))
+            # Volatile, as a replay publishes keyframes: it fits latched publishers too.
+            node.create_subscription(make(topic.type), topic.name, take, qos_profile(topic.qos, lossless=True))
 
     def _state(self, name: str, msg: Any) -> None:
         self.news = time.monotonic()

@@ -20,8 +20,8 @@ from sf_bringup.shared_memory import sweep_shared_memory
 from sf_bringup.wiring import NodeLaunch
 from sf_interfaces.errors import ConfigError, SceneFactoryError
 
-_START_S = 60.0  # importing torch on a busy machine takes a while
-_TRANSITION_S = 60.0
+_START_S = 180.0  # importing torch on a busy machine takes a while; a node that dies meanwhile is noticed at once
+_TRANSITION_S = 120.0
 _ANSWER_S = 5.0
 _NICE = 10
 _TRANSITIONS = (

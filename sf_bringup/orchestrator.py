@@ -239,10 +239,19 @@ def _pairs(given: Sequence[str], option: str) -> dict[str, str]:
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run until Ctrl-C; exit code 0 done, 2 bad configuration or a node that keeps dying."""
+    """Run until Ctrl-C; exit code 0 done, 2 bad configuration or a node that keeps dying.
+
+    A second signal ends it without waiting for results: the nodes die with their parent.
+    """
     stopping: list[int] = []
+
+    def stop(number: int, _: Any) -> None:
+        stopping.append(number)
+        if len(stopping) > 1:
+            raise KeyboardInterrupt
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda n, _: stopping.append(n))
+        signal.signal(number, stop)
     try:
         given = parse(args)
         config = ConfigFile.load(given.config, _pairs(given.set, "--set"))

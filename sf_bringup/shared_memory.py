@@ -5,16 +5,20 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from pathlib import Path
 
 _FOLDER = Path("/dev/shm")
 _PREFIXES = ("fastrtps_", "fastdds_")
+_YOUNG_S = 5.0  # a segment this new may belong to a process that is just about to lock it
 _LOCK = "_el"  # each segment and port has such a file; its owner holds a lock on it, which ends with the process
 
 
 def _held(lock: Path) -> bool:
     """Whether a living process owns the segment."""
     try:
+        if time.time() - lock.stat().st_mtime < _YOUNG_S:
+            return True
         file = os.open(lock, os.O_RDWR)
     except FileNotFoundError:
         return True  # its owner is just removing it

@@ -25,6 +25,7 @@ class FlexionConfig:
     step: int = option(0, "distance of the neighbours in px, larger is calmer (0: from the noise)", low=0, high=32)
     median: int = option(5, "side of the median filter on depth in px, odd; 1 = none", low=1, high=9)
     bits: int = option(8, "depth of the image: 8 (mono8) or 16 (mono16)", low=8, high=16)
+    smooth: float = option(0.25, "blur as a share of a step that the noise made larger than 1", low=0.0, high=1.0)
 
     def __post_init__(self) -> None:
         if self.variant not in VARIANTS:

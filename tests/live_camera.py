@@ -46,6 +46,7 @@ def main() -> None:
     parser.add_argument("--compressed", action="store_true")
     parser.add_argument("--rate", type=float, default=10.0)
     parser.add_argument("--seconds", type=float, default=600.0)
+    parser.add_argument("--log", help="file that gets the stamp in ns and the number of each frame")
     args = parser.parse_args()
     data = np.load(args.frames)
     rgb, mm, k = data["rgb"], data["mm"], data["k"]
@@ -77,6 +78,10 @@ def main() -> None:
             msg.header = calibrated.header
             publisher.publish(msg)
         info.publish(calibrated)
+        if args.log:
+            stamp = calibrated.header.stamp
+            with open(args.log, "a") as log:
+                log.write(f"{stamp.sec * 1_000_000_000 + stamp.nanosec} {index}\n")
         i += 1
         rclpy.spin_once(node, timeout_sec=0)
         time.sleep(max(0.0, begin + i / args.rate - time.monotonic()))

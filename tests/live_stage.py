@@ -14,8 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from sf_bringup.simulate import SimulationSpec, simulate
+from sf_interfaces.geometry import se3
+from sf_interfaces.geometry.align import align
 from sf_interfaces.io.bag import BagReader
-from sf_interfaces.ros.messages import decode_depth, decode_image
+from sf_interfaces.ros.messages import decode_depth, decode_image, decode_pose
+from sf_interfaces.types import Trajectory
 
 DRIVER = Path(__file__).parent / "live_camera.py"
 FAST = ["--set", "recon.iterations=4", "--set", "recon.final_iterations=4", "--set", "recon.keyframe_pixels=8192"]
@@ -23,20 +26,22 @@ PATIENCE_S = 150.0  # on a machine that does other things too
 
 
 def make_frames(folder: Path, count: int = 24) -> Path:
-    """Colour, millimetres and calibration of a short walk."""
+    """Colour, millimetres, calibration and true poses of a short walk."""
     bag = folder / "rgbd.mcap"
     size = {"width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
     simulate(SimulationSpec("lounge", frames=count, fps=10.0, depth="exact", **size), bag)
-    rgb, mm = [], []
+    rgb, mm, poses = [], [], []
     with BagReader(bag) as reader:
         for raw in reader.messages(["/camera/color/image_raw"]):
             rgb.append(decode_image(reader.decode(raw)))
         for raw in reader.messages(["/camera/depth/image_raw"]):
             z = decode_depth(reader.decode(raw)).z
             mm.append(np.nan_to_num(z * 1000).astype(np.uint16))
+        for raw in reader.messages(["/ground_truth/pose"]):
+            poses.append(decode_pose(reader.decode(raw))[2])
         info = reader.decode(next(iter(reader.messages(["/camera/color/camera_info"]))))
     k = np.array(info.k)[[0, 4, 2, 5]]
-    np.savez(folder / "frames.npz", rgb=np.array(rgb), mm=np.array(mm), k=k)
+    np.savez(folder / "frames.npz", rgb=np.array(rgb), mm=np.array(mm), k=k, poses=np.array(poses))
     return folder / "frames.npz"
 
 
@@ -52,6 +57,7 @@ class Stage:
         own = {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": reach}
         self.environment = {**os.environ, **own}
         self.children: list[subprocess.Popen[bytes]] = []
+        self.stamps = str(out / "stamps.txt")
         out.mkdir(parents=True, exist_ok=True)
 
     def spawn(self, *command: str) -> subprocess.Popen[bytes]:
@@ -62,7 +68,7 @@ class Stage:
         return child
 
     def camera(self, namespace: str, *more: str) -> subprocess.Popen[bytes]:
-        return self.spawn(str(DRIVER), str(self.frames), namespace, "--rate", "8", *more)
+        return self.spawn(str(DRIVER), str(self.frames), namespace, "--rate", "8", "--log", self.stamps, *more)
 
     def up(self, *more: str) -> subprocess.Popen[bytes]:
         return self.spawn("-m", "sf_bringup.cli", "up", "--out", str(self.out), *FAST, *more)
@@ -93,6 +99,14 @@ class Stage:
 
     def kill(self, module: str) -> None:
         os.kill(self.process(module), signal.SIGKILL)
+
+    def errors(self, trajectory: Trajectory) -> np.ndarray:
+        """Distances to the true positions after alignment, m."""
+        index = dict(np.loadtxt(self.stamps, dtype=np.int64).tolist())
+        truth = np.load(self.frames)["poses"]
+        truth = np.array([truth[index[stamp]][:3, 3] for stamp in trajectory.stamps_ns.tolist()])
+        _, T = align(trajectory.positions, truth)
+        return np.linalg.norm(se3.transform(T, trajectory.positions) - truth, axis=1)
 
     def poses_saved(self) -> int:
         """Poses in the tracker's last snapshot."""

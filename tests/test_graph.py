@@ -20,7 +20,7 @@ from sf_bringup.simulate import SimulationSpec, simulate
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.trajectory import read_tum
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.timeout(900)]
 FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.pixels=1024"]
 _domains = iter(range(40, 90))
 
@@ -39,7 +39,7 @@ def environment() -> dict[str, str]:
     return {**os.environ, **own}
 
 
-def sf(environment: dict[str, str], *args: str, timeout: float = 200) -> subprocess.CompletedProcess[str]:
+def sf(environment: dict[str, str], *args: str, timeout: float = 400) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "sf_bringup.cli", *args]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout)
 

@@ -153,8 +153,8 @@ def test_a_lossless_node_gives_the_same_images_as_its_core(node: subprocess.Pope
             assert np.array_equal(images[stamp_ns], flexion_image(depth, CAMERA, FlexionConfig()))
         node.send_signal(signal.SIGTERM)
         start = time.monotonic()
-        assert node.wait(timeout=5) == 0
-        assert time.monotonic() - start < 1.5
+        assert node.wait(timeout=30) == 0
+        assert time.monotonic() - start < 10.0  # a moment, on a machine that does other things too
     finally:
         driver.destroy_node()
         rclpy.shutdown(context=context)

@@ -61,23 +61,7 @@ def test_map_and_trajectory_outlive_the_nodes(stage: Stage) -> None:
     stage.end()
     trajectory = read_tum(stage.out / "trajectory.tum")
     assert len(trajectory) >= saved
-    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
-    assert steps.max() < 0.8, "the restarted tracker found its place in the map"
+    errors = stage.errors(trajectory)
+    assert np.median(errors) < 0.05 and errors.max() < 0.2, "the restarted tracker found its place in the map"
     assert (stage.out / "map.sfmap").stat().st_size > 0 and (stage.out / "surface.ply").is_file()
     assert not set(orphaned_segments()) - before_test, "shared memory of killed processes is removed"
-
-
-def test_a_node_that_keeps_dying_is_given_up_and_the_line_goes_on(stage: Stage) -> None:
-    stage.camera("/cam")
-    up = stage.up()
-    stage.says("started tracking, recon")
-    for death in (1, 2, 3):
-        stage.kill("sf_recon.node")
-        stage.says("node recon was killed", death)
-        stage.says("node recon restarted", death)
-    stage.kill("sf_recon.node")
-    stage.says("the line goes on without recon")
-    count = stage.poses_saved()
-    stage.until(lambda: stage.poses_saved() > count, "more poses")
-    stage.end()
-    assert up.returncode == 0

@@ -8,6 +8,7 @@ import os
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -36,8 +37,24 @@ def plug(namespace: str, end: str) -> None:
     inside(namespace, "route", "replace", "224.0.0.0/4", "dev", end)
 
 
+@contextmanager
+def host(namespace: str) -> Iterator[list[str]]:
+    """Words that run a command on a host: a network namespace with one /dev/shm for all its processes."""
+    ready = "mount -t tmpfs -o size=1g tmpfs /dev/shm && echo ready && exec sleep infinity"
+    command = ["ip", "netns", "exec", namespace, "unshare", "-m", "sh", "-c", ready]
+    holder = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert holder.stdout is not None
+    try:
+        if holder.stdout.readline().strip() != "ready":
+            pytest.skip("a /dev/shm per host cannot be mounted here")
+        yield ["nsenter", "-t", str(holder.pid), "-m", "-n"]
+    finally:
+        holder.kill()
+        holder.wait()
+
+
 @pytest.fixture
-def hosts() -> Iterator[None]:
+def hosts() -> Iterator[tuple[list[str], list[str]]]:
     if os.geteuid() != 0:
         pytest.skip("network namespaces need root")
     try:
@@ -48,16 +65,11 @@ def hosts() -> Iterator[None]:
             inside(namespace, "link", "set", "lo", "up")
             inside(namespace, "addr", "add", address, "dev", end)
             plug(namespace, end)
-        yield
+        with host(ROBOT) as robot, host(STATION) as station:
+            yield robot, station
     finally:
         for namespace in (ROBOT, STATION):
             ip("netns", "del", namespace, check=False)
-
-
-def on(namespace: str) -> list[str]:
-    """Words that run a command in a namespace with a /dev/shm of its own, as on a host of its own."""
-    private = 'mount -t tmpfs -o size=1g tmpfs /dev/shm && exec "$@"'
-    return ["ip", "netns", "exec", namespace, "unshare", "-m", "sh", "-c", private, "sh"]
 
 
 def newest(stage: Stage) -> int:
@@ -66,12 +78,12 @@ def newest(stage: Stage) -> int:
     return int(json.loads(path.read_text())["stamp_ns"]) if path.is_file() else 0
 
 
-def test_a_line_on_two_hosts_survives_a_cut_link(hosts: None, tmp_path: Path) -> None:
+def test_a_line_on_two_hosts_survives_a_cut_link(hosts: tuple[list[str], list[str]], tmp_path: Path) -> None:
     frames, domain = make_frames(tmp_path), 100 + os.getpid() % 100
     config = tmp_path / "two_hosts.yaml"
     config.write_text("hosts: {recon: station}\n")
-    robot = Stage(frames, tmp_path / "robot", domain, on(ROBOT), "SUBNET")
-    station = Stage(frames, tmp_path / "station", domain, on(STATION), "SUBNET")
+    robot = Stage(frames, tmp_path / "robot", domain, hosts[0], "SUBNET")
+    station = Stage(frames, tmp_path / "station", domain, hosts[1], "SUBNET")
     try:
         robot.camera("/robot/cam", "--compressed")
         robot.up("--config", str(config))

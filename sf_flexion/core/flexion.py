@@ -7,7 +7,9 @@ Bright is flat, dark is an edge, a crease or no data. It replaces the colour ima
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,7 +43,17 @@ class Flexion:
         for inner, value in self._strips(depth, camera):
             value[np.isnan(value)] = 0.0
             image[inner] = np.rint(np.multiply(value, np.float32(full), out=value), out=value)
-        return image
+        return self._smooth(image)
+
+    def _smooth(self, image: NDArray[Any]) -> NDArray[Any]:
+        """Blur what is finer than the step, because that is noise: a tracker follows it from frame to frame in vain.
+
+        Where the step is given or 1 the image stays as published. Unknown pixels become grey towards their rim.
+        """
+        assert self.step is not None
+        if self._config.step or self.step == 1 or self._config.smooth == 0:
+            return image
+        return np.asarray(cv2.GaussianBlur(image, (0, 0), self._config.smooth * self.step))
 
     def value(self, depth: DepthMap, camera: Camera) -> Float32:
         """The flexion [H, W] itself, in 0..1; NaN where one of the eight neighbours has no depth.

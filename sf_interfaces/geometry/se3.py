@@ -7,13 +7,21 @@ function takes any number of leading batch axes.
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
 _SMALL_ANGLE = 1e-4  # rad; below it the series is more exact than the closed form
+
+
+def _rotation() -> Any:
+    """SciPy's rotations, imported on first use: that takes longer than all else a small process does."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation
 
 
 def hat(w: Array) -> Array:
@@ -55,7 +63,7 @@ def log(T: Array) -> Array:
     """Logarithm of SE(3), inverse of :func:`exp` for angles below pi. [..., 4, 4] -> [..., 6]."""
     T = np.asarray(T, dtype=np.float64)
     batch = T.shape[:-2]
-    w = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*batch, 3)
+    w = _rotation().from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*batch, 3)
     _, b, c = _series(w)
     W = hat(w)
     V = np.eye(3) + b * W + c * (W @ W)
@@ -95,7 +103,7 @@ def from_quaternion(translation: Array, xyzw: Array) -> Array:
     translation = np.asarray(translation, dtype=np.float64)
     q = np.asarray(xyzw, dtype=np.float64)
     T = np.zeros((*translation.shape[:-1], 4, 4))
-    T[..., :3, :3] = Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
+    T[..., :3, :3] = _rotation().from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
     T[..., :3, 3] = translation
     T[..., 3, 3] = 1.0
     return T
@@ -104,7 +112,7 @@ def from_quaternion(translation: Array, xyzw: Array) -> Array:
 def to_quaternion(T: Array) -> tuple[Array, Array]:
     """Translation [..., 3] and unit quaternion xyzw [..., 4] with w >= 0."""
     T = np.asarray(T, dtype=np.float64)
-    q = Rotation.from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
+    q = _rotation().from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_quat(canonical=True)
     return T[..., :3, 3].copy(), q.reshape(*T.shape[:-2], 4)
 
 

@@ -59,7 +59,7 @@ def test_sixteen_bits_round_the_same_value_finer() -> None:
     depth = DepthMap(noisy_plane(1e-3))
     value = Flexion(FlexionConfig()).value(depth, CAMERA)
     for bits, full, kind in ((8, 255, np.uint8), (16, 65535, np.uint16)):
-        image = flexion_image(depth, CAMERA, FlexionConfig(bits=bits))
+        image = flexion_image(depth, CAMERA, FlexionConfig(bits=bits, smooth=0.0))
         assert image.dtype == kind
         np.testing.assert_allclose(image / full, np.nan_to_num(value), atol=0.5 / full + 1e-7)
     in_line = make(ConfigFile({"flexion": {"bits": 16}}))(depth, CAMERA)
@@ -93,3 +93,15 @@ def test_real_structured_light_asks_for_a_large_step(shared_data: Callable[[str]
         bent[step] = float((value[np.isfinite(value)] < 0.95).mean())
     assert flexion.step is not None and flexion.step >= 4
     assert bent[0] < 0.5 * bent[1], "walls become flat, which at step 1 quantisation hides"
+
+
+def test_noise_finer_than_the_step_is_blurred_only_where_the_step_was_chosen() -> None:
+    depth = DepthMap(noisy_plane(3e-3))
+    chosen, given = Flexion(FlexionConfig(median=1)), Flexion(FlexionConfig(median=1, smooth=0.0))
+    inner = np.s_[20:-20, 20:-20]
+    calm, raw = chosen(depth, CAMERA)[inner].astype(float), given(depth, CAMERA)[inner].astype(float)
+    assert calm.std() < 0.5 * raw.std() and abs(calm.mean() - raw.mean()) < 1.0
+    step = chosen.step
+    assert step is not None and step > 1
+    fixed = (flexion_image(depth, CAMERA, FlexionConfig(step=step, median=1, smooth=s)) for s in (0.0, 0.25))
+    np.testing.assert_array_equal(*fixed)
