@@ -22,7 +22,7 @@ from sf_recon.core.keyframe_view import KeyframeView
 _TOLERANCE = 0.03  # of the depth: a surface farther from a keyframe's depth is not the one it saw
 _FEATHER = 16.0  # px over which a keyframe fades out towards its border
 _UNKNOWN = 0.1  # weight of a keyframe pixel without depth: it may show something nearer
-_ENOUGH = 0.99  # fraction of covered pixels at which no further keyframe is asked
+_ENOUGH = 0.98  # fraction of the surface's pixels at which no further keyframe is asked
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +63,12 @@ def detail(
     distances = view_distances(T_map_camera, np.stack([v.T_map_camera for v in views]), float(np.median(z)))
     for rank, index in enumerate(np.argsort(distances, kind="stable")[:count]):
         trust = float(np.clip(1.5 - distances[index] / reach, 0, 1))
-        if trust == 0 or (rank > 1 and (confidence >= trust).mean() > _ENOUGH):
+        if trust == 0 or (rank > 1 and (confidence >= trust).sum() > _ENOUGH * surface.sum()):
             break
         image, weight = _reproject(views[index], camera, T_map_camera, z, surface)
         np.maximum(confidence, trust * weight, out=confidence)
         weight *= np.float32(1 / (distances[index] ** 2 + 1e-5))
-        color += weight[..., None] * image
+        color += cv2.multiply(image, cv2.merge([weight] * 3), dtype=cv2.CV_32F)
         total += weight
     return Detail(color / np.maximum(total, 1e-12)[..., None], confidence, total > 0)
 
@@ -95,6 +95,7 @@ def _reproject(
     y -= np.float32(0.5)
     image = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.remap(view.z, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) * np.float32(view.step)
-    weight[surface & (np.abs(seen - d) > _TOLERANCE * d) & (seen > 0)] = 0
-    weight[seen == 0] *= np.float32(_UNKNOWN)
+    unknown = seen == 0
+    weight *= ~surface | unknown | (np.abs(seen - d) <= np.float32(_TOLERANCE) * d)
+    weight *= np.where(unknown, np.float32(_UNKNOWN), np.float32(1))
     return image, weight
