@@ -1,10 +1,12 @@
 """Held-out colour on a real RGB-D recording, all methods with the same poses and depth.
 
-    python benchmarks/colour.py --data FOLDER/rgbd_7scenes_redkitchen_000_199 [--step 10] [--frames 200] [--set k=v]
+    python benchmarks/colour.py FOLDER/rgbd_7scenes_redkitchen_000_199 [--step 10] [--frames 200] [--set k=v]
+    sf simulate room0 room0.mcap --depth exact --mesh room0.ply
+    python benchmarks/colour.py room0.mcap --mesh room0.ply --methods ours
 
 Every ``step``-th frame is a keyframe; the frames half-way between are rendered and compared. Methods: the
 reconstruction, the same without keyframe detail, Open3D's 5 mm colour TSDF ray-cast, and the keyframe before warped
-by its own depth.
+by its own depth. With the true mesh of a simulated bag, the reconstructed one is measured too.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -18,14 +20,15 @@ from typing import Any
 
 import numpy as np
 import open3d as o3d
-from common import Benchmark, print_rows
+from common import Benchmark, load_frames, print_rows
 
-from sf_bringup.evaluation import psnr, ssim
+from sf_bringup.evaluation import Samples, psnr, ssim, surface_error
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.geometry import se3
 from sf_interfaces.io.datasets.indoor import SevenScenes
 from sf_interfaces.types import Float64, Keyframe, UInt8
 from sf_recon.config import ReconConfig
+from sf_recon.core.mesh import extract
 from sf_recon.core.reconstruction import Reconstruction
 
 Drawn = tuple[UInt8, np.ndarray]  # image [H, W, 3], pixels the method fills [H, W]
@@ -34,20 +37,29 @@ Method = Callable[[Keyframe], Drawn]
 _VOXEL, _TRUNCATION, _FAR = 0.005, 8.0, 5.0  # Open3D's usual setting for a Kinect
 
 
-def load(folder: Path, frames: int, step: int) -> tuple[list[Keyframe], list[Keyframe]]:
-    """(keyframes, held-out frames) with registered depth."""
-    keys, held = [], []
-    for index, read in enumerate(islice(SevenScenes(folder).samples(), frames)):
-        if index % step not in (0, step // 2):
-            continue
-        s = read()
-        frame = Keyframe(s.stamp_ns, s.camera, s.image, se3.orthonormalise(s.pose), s.depth)
-        (held if index % step else keys).append(frame)
-    return keys, held
+def load(data: Path, frames: int, step: int) -> tuple[list[Keyframe], list[Keyframe]]:
+    """(keyframes, held-out frames) with registered depth, of a 7-Scenes folder or a simulated bag."""
+    if data.is_dir():
+        readers = list(islice(SevenScenes(data).samples(), frames))
+        samples = {i: readers[i]() for i in range(len(readers)) if i % step in (0, step // 2)}
+        made = {i: Keyframe(s.stamp_ns, s.camera, s.image, s.pose, s.depth) for i, s in samples.items()}
+    else:
+        every = enumerate(load_frames(data)[:frames])
+        made = {i: Keyframe(f.stamp_ns, f.camera, f.image, f.T_map_camera, f.depth) for i, f in every}
+    keys = [k for i, k in made.items() if i % step == 0]
+    return keys, [k for i, k in made.items() if i % step == step // 2]
 
 
-def ours(keys: list[Keyframe], config: ReconConfig) -> tuple[Method, dict[str, Any]]:
-    """The reconstruction and what it cost."""
+def surface(built: Reconstruction, keys: list[Keyframe], truth: Path) -> dict[str, float]:
+    """Errors of the reconstructed mesh, culled to what lies in a keyframe's frustum."""
+    made, true = extract(built, built.config.mesh), o3d.io.read_triangle_mesh(str(truth))
+    pair = [Samples(np.asarray(m.vertices), np.asarray(m.triangles)) for m in (made, true)]
+    error = surface_error(*pair, (keys[0].camera, np.array([k.T_map_camera for k in keys])), samples=50_000)
+    return {"Acc cm": error.accuracy, "Comp cm": error.completion, "ratio %": error.completion_ratio}
+
+
+def ours(keys: list[Keyframe], config: ReconConfig, mesh: Path | None) -> tuple[Method, dict[str, Any]]:
+    """The reconstruction, what it cost, and how good its surface is."""
     built = Reconstruction(config)
     started = time.perf_counter()
     for key in keys:
@@ -63,7 +75,7 @@ def ours(keys: list[Keyframe], config: ReconConfig) -> tuple[Method, dict[str, A
         return view.image, view.depth.valid
 
     facts = {"train s": round(seconds, 1), "points": len(built.surface()), "draw ms": drawing}
-    return draw, facts
+    return draw, facts if mesh is None else facts | surface(built, keys, mesh)
 
 
 def tsdf(keys: list[Keyframe]) -> Method:
@@ -142,7 +154,8 @@ def score(method: Method, held: list[Keyframe], others: list[np.ndarray] | None)
 def main() -> None:
     """Build, render, compare."""
     bench = Benchmark("colour", __doc__ or "")
-    bench.parser.add_argument("--data", type=Path, required=True, help="folder of a 7-Scenes sequence")
+    bench.parser.add_argument("data", type=Path, help="folder of a 7-Scenes sequence, or a simulated bag")
+    bench.parser.add_argument("--mesh", type=Path, help="true surface of a simulated bag")
     bench.parser.add_argument("--frames", type=int, default=200)
     bench.parser.add_argument("--step", type=int, default=10)
     bench.parser.add_argument("--methods", nargs="+", default=["ours", "field", "tsdf", "warp"])
@@ -157,7 +170,7 @@ def main() -> None:
         if name in ("ours", "field"):
             values = given | ({"detail": "0"} if name == "field" else {})
             config = ConfigFile.load(None, {f"recon.{k}": v for k, v in values.items()}).build("recon", ReconConfig)
-            method, facts = ours(keys, config)
+            method, facts = ours(keys, config, args.mesh)
         else:
             method = {"tsdf": tsdf, "warp": warp}[name](keys)
         measured = score(method, held, filled)
@@ -165,7 +178,10 @@ def main() -> None:
             facts["draw ms"] = round(1e3 * float(np.median(facts["draw ms"])))
         rows.append({"method": name, **measured, **facts})
     print_rows(rows)
-    bench.write("Held-out colour on real RGB-D", {f"{len(keys)} keyframes, {len(held)} held out": rows})
+    bench.write(
+        "Held-out colour, all methods with the same poses and depth",
+        {f"{len(keys)} keyframes, {len(held)} held out": rows},
+    )
 
 
 if __name__ == "__main__":
