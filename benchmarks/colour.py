@@ -22,7 +22,7 @@ import numpy as np
 import open3d as o3d
 from common import Benchmark, load_frames, print_rows
 
-from sf_bringup.evaluation import Samples, psnr, ssim, surface_error
+from sf_bringup.evaluation import Samples, psnr, ssim
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.geometry import se3
 from sf_interfaces.io.datasets.indoor import SevenScenes
@@ -50,12 +50,32 @@ def load(data: Path, frames: int, step: int) -> tuple[list[Keyframe], list[Keyfr
     return keys, [k for i, k in made.items() if i % step == step // 2]
 
 
-def surface(built: Reconstruction, keys: list[Keyframe], truth: Path) -> dict[str, float]:
-    """Errors of the reconstructed mesh, culled to what lies in a keyframe's frustum."""
+def surface(built: Reconstruction, keys: list[Keyframe], truth: Path, count: int = 100_000) -> dict[str, float]:
+    """Distances from samples of one mesh to the triangles of the other, where a keyframe saw the surface.
+
+    A true sample counts if a keyframe's depth shows it: parts inside the furniture are nobody's to complete.
+    """
     made, true = extract(built, built.config.mesh), o3d.io.read_triangle_mesh(str(truth))
-    pair = [Samples(np.asarray(m.vertices), np.asarray(m.triangles)) for m in (made, true)]
-    error = surface_error(*pair, (keys[0].camera, np.array([k.T_map_camera for k in keys])), samples=50_000)
-    return {"Acc cm": error.accuracy, "Comp cm": error.completion, "ratio %": error.completion_ratio}
+    samples = [Samples(np.asarray(m.vertices), np.asarray(m.triangles)).draw(count) for m in (made, true)]
+    seen = np.zeros(count, bool)
+    for key in keys:
+        uv, z = key.camera.project(se3.transform(se3.inverse(key.T_map_camera), samples[1]))
+        column, row = np.floor(uv).astype(int).T
+        inside = (z > 0) & (column >= 0) & (column < key.camera.width) & (row >= 0) & (row < key.camera.height)
+        assert key.depth is not None
+        seen[inside] |= np.abs(key.depth.z[row[inside], column[inside]] - z[inside]) < 0.01 * z[inside]
+    accuracy, completion = _distance(samples[0], true), _distance(samples[1][seen], made)
+    return {
+        "Acc cm": 100 * float(accuracy.mean()),
+        "Comp cm": 100 * float(completion.mean()),
+        "ratio %": 100 * float((completion < 0.05).mean()),
+    }
+
+
+def _distance(points: Float64, mesh: o3d.geometry.TriangleMesh) -> np.ndarray:
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.t.geometry.TriangleMesh.from_legacy(mesh))
+    return scene.compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
 
 
 def ours(keys: list[Keyframe], config: ReconConfig, mesh: Path | None) -> tuple[Method, dict[str, Any]]:
