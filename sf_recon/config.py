@@ -20,7 +20,7 @@ class ReconConfig:
     min_resolution: float = option(0.005, "lower bound of the automatic resolution for metric depth, m", low=0.0)
     levels: int = option(3, "number of resolutions", low=1, high=8)
     multiplier: float = option(4.0, "ratio of successive resolutions", low=1.5, high=16.0)
-    features: int = option(8, "length of a point's feature on each level; the first three hold colour", low=3, high=64)
+    features: int = option(6, "length of a point's feature on each level; the first three hold colour", low=3, high=64)
     neighbours: int = option(4, "points interpolated on each level (K)", low=1, high=16)
     sigma: float = option(1.0, "interpolation weight exp(-d2 / (sigma * resolution2))", low=0.01, high=100.0)
     hidden: int = option(32, "width of the two hidden layers of the colour network", low=4, high=256)

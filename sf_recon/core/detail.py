@@ -19,10 +19,11 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float32, Float64
 from sf_recon.core.keyframe_view import KeyframeView
 
-_TOLERANCE = 0.03  # of the depth: a surface farther from a keyframe's depth is not the one it saw
+_DOUBT = 0.05  # of the depth: a keyframe whose own depth is off by so much counts half
+_OTHER = 0.3  # of the depth: off by more, it saw another surface. Poses and the drawn edges err by some percent.
 _FEATHER = 16.0  # px over which a keyframe fades out towards its border
 _UNKNOWN = 0.1  # weight of a keyframe pixel without depth: it may show something nearer
-_ENOUGH = 0.99  # fraction of covered pixels at which no further keyframe is asked
+_ENOUGH = 0.98  # fraction of the surface's pixels at which no further keyframe is asked
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,20 +64,24 @@ def detail(
     distances = view_distances(T_map_camera, np.stack([v.T_map_camera for v in views]), float(np.median(z)))
     for rank, index in enumerate(np.argsort(distances, kind="stable")[:count]):
         trust = float(np.clip(1.5 - distances[index] / reach, 0, 1))
-        if trust == 0 or (rank > 1 and (confidence >= trust).mean() > _ENOUGH):
+        if trust == 0 or (rank > 1 and (confidence >= trust).sum() > _ENOUGH * surface.sum()):
             break
-        image, weight = _reproject(views[index], camera, T_map_camera, z, surface)
-        np.maximum(confidence, trust * weight, out=confidence)
-        weight *= np.float32(1 / (distances[index] ** 2 + 1e-5))
-        color += weight[..., None] * image
+        image, covered, agreement = _reproject(views[index], camera, T_map_camera, z, surface)
+        np.maximum(confidence, trust * covered, out=confidence)
+        weight = covered * agreement * np.float32(1 / (distances[index] ** 2 + 1e-5))
+        color += cv2.multiply(image, cv2.merge([weight] * 3), dtype=cv2.CV_32F)
         total += weight
     return Detail(color / np.maximum(total, 1e-12)[..., None], confidence, total > 0)
 
 
 def _reproject(
     view: KeyframeView, camera: Camera, T_map_camera: Float64, z: Float32, surface: NDArray[np.bool_]
-) -> tuple[NDArray[np.uint8], Float32]:
-    """The view's colour [H, W, 3] at each pixel's surface, and whether it saw that, faded at the border, [H, W]."""
+) -> tuple[NDArray[np.uint8], Float32, Float32]:
+    """What a view shows of each pixel's surface.
+
+    Returns:
+        Its colour [H, W, 3]; whether it saw that surface, faded at its border, [H, W]; how well its depth agrees, 0..1.
+    """
     T = se3.inverse(view.T_map_camera) @ T_map_camera
     A = (view.camera.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32)
     b = (view.camera.K @ T[:3, 3]).astype(np.float32)
@@ -95,6 +100,9 @@ def _reproject(
     y -= np.float32(0.5)
     image = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen = cv2.remap(view.z, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) * np.float32(view.step)
-    weight[surface & (np.abs(seen - d) > _TOLERANCE * d) & (seen > 0)] = 0
-    weight[seen == 0] *= np.float32(_UNKNOWN)
-    return image, weight
+    off = np.abs(seen - d) / d
+    off[(seen == 0) | ~surface] = 0
+    weight *= off < np.float32(_OTHER)
+    agreement = 1 / (1 + np.square(off * np.float32(1 / _DOUBT)))
+    agreement[seen == 0] = _UNKNOWN
+    return image, weight, agreement

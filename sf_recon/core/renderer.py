@@ -96,24 +96,32 @@ class Renderer:
         c = self.config
         z, levels = self.depth(camera, T_map_camera)
         surface = np.isfinite(z)
-        image = np.zeros((*z.shape, 3), np.float32)
-        trust = np.zeros(z.shape, np.float32)
+        image, trust = np.zeros((*z.shape, 3), np.float32), np.zeros(z.shape, np.float32)
         if c.detail and len(views) and surface.any():
             found = detail(views, camera, T_map_camera, fill(z), surface, count=c.detail, reach=c.detail_reach)
-            shown = found.known & (surface | c.fill_holes)
-            image[shown], trust = found.color[shown], found.confidence
-        for level in range(len(self.points.levels)):
-            open_ = np.flatnonzero(surface & (trust < 1) & (levels == level))
-            points, _ = backproject(camera, T_map_camera, z.reshape(-1)[open_], open_)
-            learnt = 255 * self.field.color(points, T_map_camera[:3, 3], level)
-            share, flat = trust.reshape(-1)[open_, None], image.reshape(-1, 3)
-            flat[open_] = share * flat[open_] + (1 - share) * learnt
-        shown_image = np.rint(np.clip(image, 0, 255)).astype(np.uint8)
+            image, trust = found.color, found.confidence
+            if not c.fill_holes:
+                image[~surface] = 0
+        self._add_learnt(image, trust, camera, T_map_camera, z, levels)
+        shown = cv2.convertScaleAbs(image)  # rounds and saturates
         if not full:
-            return RenderedView(shown_image, DepthMap(z, scale=scale))
+            return RenderedView(shown, DepthMap(z, scale=scale))
         depth = DepthMap(z, self._variance(camera, T_map_camera, z), scale)
         gap = c.layer_gap * self.points.levels[0].spacing
-        return RenderedView(shown_image, depth, normals(camera, z, gap))
+        return RenderedView(shown, depth, normals(camera, z, gap))
+
+    def _add_learnt(
+        self, image: Float32, trust: Float32, camera: Camera, T_map_camera: Float64, z: Float32, levels: UInt8
+    ) -> None:
+        """Mix the field's colour into the image [H, W, 3] in 0..255 where the keyframes are not trusted fully."""
+        open_ = np.flatnonzero(np.isfinite(z) & (trust < 1))
+        drawn_by = levels.reshape(-1)[open_]
+        for level in range(len(self.points.levels)):
+            pixels = open_[drawn_by == level]
+            points, _ = backproject(camera, T_map_camera, z.reshape(-1)[pixels], pixels)
+            learnt = 255 * self.field.color(points, T_map_camera[:3, 3], level)
+            share, flat = trust.reshape(-1)[pixels, None], image.reshape(-1, 3)
+            flat[pixels] = share * flat[pixels] + (1 - share) * learnt
 
     def _variance(self, camera: Camera, T_map_camera: Float64, z: Float32) -> Float32:
         """Variance [H, W] m^2 of the nearest point of the finest level that has one near; NaN at holes."""

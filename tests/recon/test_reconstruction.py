@@ -81,7 +81,7 @@ def test_a_keyframe_says_nothing_about_what_it_did_not_see(room: Reconstruction)
     blank = KeyframeView.make(0, CAMERA, key.T_map_camera, np.zeros((120, 160, 3), np.uint8), z, None)
     surface = np.ones(z.shape, bool)
     seen = detail([blank], CAMERA, key.T_map_camera, z, surface, count=1, reach=0.5)
-    behind = detail([blank], CAMERA, key.T_map_camera, 1.2 * z, surface, count=1, reach=0.5)
+    behind = detail([blank], CAMERA, key.T_map_camera, 2.0 * z, surface, count=1, reach=0.5)
     away = detail([blank], CAMERA, view(9).T_map_camera, z, surface, count=1, reach=0.5)
     assert seen.confidence[20:-20, 20:-20].min() == 1 and not behind.known.any() and not away.known.any()
 
