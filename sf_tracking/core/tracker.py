@@ -90,7 +90,7 @@ class Tracker:
         if not len(self._window):
             return self._start(frame, view)
         found = self._find(frame.stamp_ns, view, camera)
-        if found is not None and self._config.shape_trust:
+        if found is not None and found.doubtful and self._config.shape_trust:
             found = self._fit_shape(frame, found)
         if found is None:
             self.state = TrackingState.LOST

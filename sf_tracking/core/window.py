@@ -79,13 +79,13 @@ class Window:
             _remember(source, stamp, sights.patch[mine], sights.uv[mine], sights.information[mine])
         for target in self.keyframes:
             self._observe(keyframe, target, found.excess)
-        for target in self.keyframes[-self._config.shape_keyframes :]:
+        for target in self.keyframes[-self._config.shape_keyframes :] if found.doubtful else ():
             if keyframe.shape is not None and target.shape is not None:
                 T = target.T_cw @ se3.inverse(keyframe.T_cw)
                 c = self._config
-                found = fit(keyframe.camera, keyframe.shape, target.shape, T, np.eye(6), c.shape_trust)
-                if found is not None:
-                    keyframe.moved[target.frame.stamp_ns] = found
+                moved = fit(keyframe.camera, keyframe.shape, target.shape, T, np.eye(6), c.shape_trust)
+                if moved is not None:
+                    keyframe.moved[target.frame.stamp_ns] = moved
         self.keyframes.append(keyframe)
 
     def _observe(self, source: TrackedKeyframe, target: TrackedKeyframe, excess: float) -> None:

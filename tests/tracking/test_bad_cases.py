@@ -85,7 +85,7 @@ def test_an_object_that_covers_half_the_image_and_moves_is_not_followed() -> Non
     tracker = Tracker(CONFIG)
     assert all(tracker.track(f).state is TrackingState.TRACKING for f in frames)
     keyframes = tracker.finish().keyframes
-    assert error_of(tracker, frames, poses) < 0.01 and len(keyframes) < len(frames) / 2
+    assert error_of(tracker, frames, poses) < 0.02 and len(keyframes) < len(frames) / 2
 
 
 def test_fast_rotation_is_followed() -> None:
