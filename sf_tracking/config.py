@@ -12,6 +12,8 @@ from sf_interfaces.config import option
 class TrackingConfig:
     """Defaults suit 640x480 to 1242x375 images at 10 to 30 Hz."""
 
+    operator: str = option("patches", "update operator: patches (alignment) or dpvo (network)")
+    checkpoint: str = option("", "file of the DPVO network's weights, for operator dpvo")
     patches: int = option(200, "patches per keyframe (M)", low=20, high=4000)
     window: int = option(9, "keyframes whose patches are aligned and whose poses are optimised", low=3, high=100)
     edges: int = option(600, "patches aligned to a frame that becomes no keyframe", low=50, high=20000)

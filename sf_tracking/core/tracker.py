@@ -15,10 +15,9 @@ from sf_tracking.config import TrackingConfig
 from sf_tracking.core.initialise import Initialiser
 from sf_tracking.core.keyframes import wants_keyframe
 from sf_tracking.core.locate import Location, Locator
-from sf_tracking.core.patches import to_gray
 from sf_tracking.core.search import relocate
 from sf_tracking.core.shape import fit, shape_of
-from sf_tracking.core.update import PatchAlignment, UpdateOperator, View
+from sf_tracking.core.update import UpdateOperator, View, make_operator
 from sf_tracking.core.window import Window
 
 _REGULAR = 1.5  # frame interval relative to the last, up to which frames count as regular
@@ -62,7 +61,7 @@ class Tracker:
 
     def __init__(self, config: TrackingConfig, operator: UpdateOperator | None = None) -> None:
         self._config = config
-        self._operator: UpdateOperator = operator or PatchAlignment(config)
+        self._operator: UpdateOperator = operator or make_operator(config)
         self._locate = Locator(config, self._operator)
         self._window = Window(config, self._operator)
         self._initialiser = Initialiser(config, self._window, self._locate)
@@ -85,7 +84,7 @@ class Tracker:
         """
         camera = self._check(frame)
         assert frame.image is not None
-        view = self._operator.view(to_gray(frame.image))
+        view = self._operator.view(frame.image)
         self._newest = frame.stamp_ns
         if not len(self._window):
             return self._start(frame, view)
