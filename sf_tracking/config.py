@@ -31,7 +31,7 @@ class TrackingConfig:
     damping: float = option(0.5, "share of the last motion that predicts the next", low=0.0, high=1.0)
     min_inliers: int = option(25, "edges that a pose has to agree with", low=6)
     inlier_px: float = option(2.0, "reprojection error of an agreeing edge, px", low=0.1)
-    keyframe_flow: float = option(0.045, "mean flow that makes a keyframe, as part of the image width", low=0.001)
+    keyframe_flow: float = option(0.06, "mean flow that makes a keyframe, as part of the image width", low=0.001)
     keyframe_overlap: float = option(0.6, "share of patches still aligned below which a keyframe is made", high=1.0)
     parallax: float = option(0.01, "flow without rotation that starts a map without depth, per width", low=0.001)
     depth_gap: float = option(0.05, "relative depth step near a patch above which it is rejected", low=0.0)

@@ -45,7 +45,6 @@ class TrackingNode(BlockNode):
     def _begin(self) -> None:
         self._tracker = Tracker(self._config)
         self._keyframes: list[tuple[int, Float64]] = []
-        self._scale = Scale.METRIC
         self._path_stamp_ns: int | None = None
         self._epoch = self._inputs.assembler.epoch
 

@@ -21,6 +21,7 @@ _SEARCHED = 200  # patches searched over levels to find the motion
 _WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must not be rejected far from the truth
 _AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
 _CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
+_MOTION = np.diag([0.03**-2] * 3 + [0.02**-2] * 3)  # information of a predicted pose, m and rad
 _HONEST, _PLENTY = 1.5, 80  # excess of errors and number of patches, from which patches alone are trusted
 _STILL = 1e-6  # step of the pose, m and rad, that ends the iterations
 _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
@@ -59,6 +60,11 @@ class Location:
     def doubtful(self) -> bool:
         """Patches err more than they claim, or are few: measured depth has something to add."""
         return self.excess > _HONEST or self.inliers < _PLENTY
+
+
+def blind_location(T_cw: Float64) -> Location:
+    """A pose that only the motion model vouches for, within centimetres and a degree."""
+    return Location(T_cw, _MOTION, 1.0, join([]), 0, 0.0, 0.0, 0.0)
 
 
 def align_sights(
@@ -185,18 +191,17 @@ class Locator:
         return solved.T_cw if enough else None
 
     def align(
-        self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, every: bool = False
+        self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, thorough: bool = False
     ) -> Location | None:
         """Pose from aligned patches of all keyframes, from a start T_cw within about a pixel.
 
-        ``every`` aligns all visible patches, else at most ``config.edges``.
+        ``thorough`` aligns twice as many patches as ``config.edges``, for an image that becomes a keyframe.
         """
         ats = [reproject(keyframe, T_cw) for keyframe in window]
         owner = np.concatenate([np.full(int(at.visible.sum()), i) for i, at in enumerate(ats)])
         patch = np.concatenate([np.flatnonzero(at.visible) for at in ats])
-        if not every:
-            chosen = _thin(np.arange(len(owner)), self._config.edges)
-            owner, patch = owner[chosen], patch[chosen]
+        chosen = _thin(np.arange(len(owner)), self._config.edges * (2 if thorough else 1))
+        owner, patch = owner[chosen], patch[chosen]
         parts = []
         for index, (keyframe, at) in enumerate(zip(window, ats, strict=True)):
             take = patch[owner == index]
