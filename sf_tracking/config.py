@@ -12,6 +12,8 @@ from sf_interfaces.config import option
 class TrackingConfig:
     """Defaults suit 640x480 to 1242x375 images at 10 to 30 Hz."""
 
+    operator: str = option("patches", "update operator: patches (alignment) or dpvo (network)")
+    checkpoint: str = option("", "file of the DPVO network's weights, for operator dpvo")
     patches: int = option(200, "patches per keyframe (M)", low=20, high=4000)
     window: int = option(9, "keyframes whose patches are aligned and whose poses are optimised", low=3, high=100)
     edges: int = option(600, "patches aligned to a frame that becomes no keyframe", low=50, high=20000)
@@ -29,7 +31,7 @@ class TrackingConfig:
     damping: float = option(0.5, "share of the last motion that predicts the next", low=0.0, high=1.0)
     min_inliers: int = option(25, "edges that a pose has to agree with", low=6)
     inlier_px: float = option(2.0, "reprojection error of an agreeing edge, px", low=0.1)
-    keyframe_flow: float = option(0.045, "mean flow that makes a keyframe, as part of the image width", low=0.001)
+    keyframe_flow: float = option(0.06, "mean flow that makes a keyframe, as part of the image width", low=0.001)
     keyframe_overlap: float = option(0.6, "share of patches still aligned below which a keyframe is made", high=1.0)
     parallax: float = option(0.01, "flow without rotation that starts a map without depth, per width", low=0.001)
     depth_gap: float = option(0.05, "relative depth step near a patch above which it is rejected", low=0.0)

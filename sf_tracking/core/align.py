@@ -37,11 +37,6 @@ class Templates:
         """The templates at ``index``."""
         return Templates(self.J[index], self.inverse[index])
 
-    @staticmethod
-    def concatenate(parts: list[Templates]) -> Templates:
-        """All templates of several sets, in order."""
-        return Templates(np.concatenate([p.J for p in parts]), np.concatenate([p.inverse for p in parts]))
-
 
 @dataclass(frozen=True, slots=True)
 class Alignment:

@@ -19,6 +19,7 @@ from sf_interfaces.types import Camera, Float64
 _MIN_Z = 0.05  # of the unit ray; a patch nearer to the target's image plane or behind it carries no information
 _DAMPING = 1e-4  # first Levenberg-Marquardt damping, relative to the diagonal
 _MAX_DAMPING = 1e4
+_SERIAL = 200_000  # multiplications below which matrix products run on one thread
 _FLOOR = 1e-9  # of a diagonal: a pose or a depth without any observation stays where it is
 
 
@@ -160,13 +161,27 @@ def _linearise(camera: Camera, p: Problem, scale: float) -> _Linear:
     return _Linear(H.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n), b.reshape(-1), C, c, E)
 
 
+def _outer(a: Float64, b: Float64) -> Float64:
+    """``a @ b.T`` of wide matrices [K, L] in blocks so small that no library splits them among threads.
+
+    The sum is then the same for any number of threads, and nothing waits for busy cores.
+    """
+    rows, columns = a.shape
+    width = max(1, _SERIAL // rows**2)
+    blocks = -(-columns // width)
+    padded = np.zeros((2, rows, blocks * width))
+    padded[0, :, :columns], padded[1, :, :columns] = a, b
+    x, y = padded.reshape(2, rows, blocks, width).transpose(0, 2, 1, 3)
+    return np.asarray((x @ y.transpose(0, 2, 1)).sum(axis=0))
+
+
 def _step(linear: _Linear, free: NDArray[np.bool_], damping: float) -> tuple[Float64, Float64]:
     """Pose steps [N, 6] (0 where fixed) and inverse depth steps [N, M] of the damped normal equations."""
     n = len(free)
     C = linear.C * (1 + damping) + _FLOOR
     E = linear.E.transpose(1, 2, 0, 3).reshape(6 * n, -1)
     over = E / C.reshape(-1)
-    S = linear.H + np.diag(damping * np.diag(linear.H) + _FLOOR) - over @ E.T
+    S = linear.H + np.diag(damping * np.diag(linear.H) + _FLOOR) - _outer(over, E)
     b = linear.b - over @ linear.c.reshape(-1)
     on = np.repeat(free, 6)
     xi = np.zeros(6 * n)
@@ -186,11 +201,14 @@ def adjust(
         scale: where the robust kernel sets in, in standard deviations.
 
     Returns:
-        The optimised problem, and the information [N, M] of its inverse depths, 1 / variance given the poses.
+        The optimised problem, and the information [N, M] of its inverse depths, 1 / variance given the poses, at the
+        last linearisation.
     """
     damping, now = _DAMPING, cost(camera, p, scale)
-    linear = _linearise(camera, p, scale)
+    linear, stale = _linearise(camera, p, scale), False
     for _ in range(iterations):
+        if stale:
+            linear, stale = _linearise(camera, p, scale), False
         xi, dw = _step(linear, free, damping)
         # Poses are products of products: without this their rotations drift from orthonormal frame by frame.
         T_cw = np.where(free[:, None, None], se3.orthonormalise(se3.exp(xi) @ p.T_cw), p.T_cw)
@@ -202,8 +220,7 @@ def adjust(
                 break
             continue
         converged = now - trial_cost < 1e-4 * now
-        p, now, damping = trial, trial_cost, max(damping / 10, 1e-9)
-        linear = _linearise(camera, p, scale)
+        p, now, damping, stale = trial, trial_cost, max(damping / 10, 1e-9), True
         if converged:
             break
     return p, linear.C

@@ -100,13 +100,13 @@ class Initialiser:
         T[:3, 3] *= unit
         _set_depth(first, np.where(pair.good, pair.w / unit, 1.0))
         window.keyframes.append(first)
-        found = self._locate.align(window.keyframes, view, T, every=True)
+        found = self._locate.align(window.keyframes, view, T, thorough=True)
         second = None if found is None else window.make(frame, view, found.T_cw)
         if found is None or second is None:
             window.keyframes.clear()
             return []
-        window.add(second, found)
-        window.optimise(fixed=1, iterations=_ITERATIONS)
+        window.add(second, found, fixed=1, iterations=_ITERATIONS)
+        window.complete()
         window.rescale(float(np.median(first.patches.w)))
         self._reference = None
         return [(stamp, self._pose(first, uv, alive)) for stamp, uv, alive in reference.tracks]

@@ -14,7 +14,7 @@ from sf_interfaces.types import Camera, DepthMap, Float64, Frame, Keyframe, Poin
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.bundle import project
 from sf_tracking.core.patches import Patches
-from sf_tracking.core.shape import Shape, ShapeFit
+from sf_tracking.core.shape import Shape, ShapeFit, shape_of
 from sf_tracking.core.update import View
 
 _LANDMARK_SIGMA = 0.2  # relative deviation of inverse depth up to which a patch is published as a landmark
@@ -32,7 +32,7 @@ class TrackedKeyframe:
     described: Any  # of the patches, by the update operator
     T_cw: Float64  # world to camera
     seen: dict[int, tuple[Float64, Float64]] = field(default_factory=dict)  # stamp -> uv [M, 2], information [M, 2, 2]
-    shape: Shape | None = None  # of its depth
+    shape: Shape | None = None  # of its depth, once asked for
     moved: dict[int, ShapeFit] = field(default_factory=dict)  # stamp -> T_other_self by alignment of the shapes
     best_share: float = 0.0  # of its patches found in one frame so far
 
@@ -41,6 +41,12 @@ class TrackedKeyframe:
         """Intrinsics; the tracker only takes frames that have them."""
         assert self.frame.camera is not None
         return self.frame.camera
+
+    def measured_shape(self, config: TrackingConfig) -> Shape | None:
+        """The surface of its depth, made when first asked for; None without depth."""
+        if self.shape is None:
+            self.shape = shape_of(self.frame, config)
+        return self.shape
 
     def final(self, scale: Scale) -> Keyframe:
         """What leaves the window: the pose is final now."""

@@ -21,6 +21,8 @@ _SEARCHED = 200  # patches searched over levels to find the motion
 _WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must not be rejected far from the truth
 _AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
 _CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
+_MOTION = np.diag([0.03**-2] * 3 + [0.02**-2] * 3)  # information of a predicted pose, m and rad
+_HONEST, _PLENTY = 1.5, 80  # excess of errors and number of patches, from which patches alone are trusted
 _STILL = 1e-6  # step of the pose, m and rad, that ends the iterations
 _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
 _STEPS = 6  # at most, per robust scale
@@ -50,8 +52,19 @@ class Location:
     excess: float  # of squared errors over what alignment claims
     sights: Sights
     inliers: int
+    support: float  # patches that agree within what alignment claims
     found: float  # share of the patches looked for that were found
     overlap: float  # share of the newest keyframe's patches that are in view and were found
+
+    @property
+    def doubtful(self) -> bool:
+        """Patches err more than they claim, or are few: measured depth has something to add."""
+        return self.excess > _HONEST or self.inliers < _PLENTY
+
+
+def blind_location(T_cw: Float64) -> Location:
+    """A pose that only the motion model vouches for, within centimetres and a degree."""
+    return Location(T_cw, _MOTION, 1.0, join([]), 0, 0.0, 0.0, 0.0)
 
 
 def align_sights(
@@ -83,6 +96,7 @@ class Solution:
     error: Float64  # [E] px, reprojection errors
     information: Float64  # [6, 6] of exp(xi) T_cw
     excess: float  # squared errors relative to what their standard deviations say, at least 1
+    support: float  # how many patches agree within what alignment claims: the sum of robust weights
 
 
 def solve_pose(
@@ -95,7 +109,7 @@ def solve_pose(
         uv, information: [E, 2] px and [E, 2, 2] where they were seen.
         scales: where the robust kernel sets in, standard deviations; narrower from one to the next.
     """
-    claimed, excess = information_root(information), 1.0
+    claimed, excess, support = information_root(information), 1.0, 0.0
     away, H = np.zeros(6), np.zeros((6, 6))
     for scale in scales:
         # Errors beyond what alignment claims (rolling shutter, depth registered badly) widen the kernel.
@@ -112,9 +126,10 @@ def solve_pose(
             if np.abs(step).max() < _STILL:
                 break
         r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
-        excess = _excess(whiten(r, claimed))
+        white = whiten(r, claimed)
+        excess, support = _excess(white), float(robust((white**2).sum(axis=0), scale)[0].sum())
     error = np.where(Xc[:, 2] > _BEHIND, np.linalg.norm(r, axis=1), np.inf)
-    return Solution(se3.orthonormalise(T_cw), error, H, excess)
+    return Solution(se3.orthonormalise(T_cw), error, H, excess, support)
 
 
 def _excess(white: Float64) -> float:
@@ -147,12 +162,13 @@ class Locator:
 
         A smooth motion is predicted well enough to align at once; else the search over levels comes first.
         """
-        if not wide:
-            found = self.align(window, view, predicted)
-            if found is not None and found.found > _CERTAIN[0] and found.inliers > _CERTAIN[1] * len(found.sights):
-                return found
+        at_once = None if wide else self.align(window, view, predicted)
+        if at_once is not None and at_once.found > _CERTAIN[0] and at_once.inliers > _CERTAIN[1] * len(at_once.sights):
+            return at_once
         T_cw = self._search(window, view, predicted, wide)
-        return None if T_cw is None else self.align(window, view, T_cw)
+        searched = None if T_cw is None else self.align(window, view, T_cw)
+        # Where much of the image moves on its own, the search may follow it; most patches decide.
+        return max((f for f in (at_once, searched) if f is not None), key=lambda f: f.support, default=None)
 
     def _search(self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, wide: bool) -> Float64 | None:
         """A first pose from the newest keyframes' patches, found over the levels of the pyramid."""
@@ -175,18 +191,17 @@ class Locator:
         return solved.T_cw if enough else None
 
     def align(
-        self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, every: bool = False
+        self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, thorough: bool = False
     ) -> Location | None:
         """Pose from aligned patches of all keyframes, from a start T_cw within about a pixel.
 
-        ``every`` aligns all visible patches, else at most ``config.edges``.
+        ``thorough`` aligns twice as many patches as ``config.edges``, for an image that becomes a keyframe.
         """
         ats = [reproject(keyframe, T_cw) for keyframe in window]
         owner = np.concatenate([np.full(int(at.visible.sum()), i) for i, at in enumerate(ats)])
         patch = np.concatenate([np.flatnonzero(at.visible) for at in ats])
-        if not every:
-            chosen = _thin(np.arange(len(owner)), self._config.edges)
-            owner, patch = owner[chosen], patch[chosen]
+        chosen = _thin(np.arange(len(owner)), self._config.edges * (2 if thorough else 1))
+        owner, patch = owner[chosen], patch[chosen]
         parts = []
         for index, (keyframe, at) in enumerate(zip(window, ats, strict=True)):
             take = patch[owner == index]
@@ -202,7 +217,14 @@ class Locator:
         overlap = share * float(ats[-1].visible.mean())
         sights = replace(sights, information=sights.information / solved.excess)
         return Location(
-            solved.T_cw, solved.information, solved.excess, sights, inliers, len(sights) / max(1, len(owner)), overlap
+            solved.T_cw,
+            solved.information,
+            solved.excess,
+            sights,
+            inliers,
+            solved.support,
+            len(sights) / max(1, len(owner)),
+            overlap,
         )
 
     def _pose(

@@ -49,6 +49,7 @@ class ShapeFit:
 
     T: Float64  # [4, 4] T_target_source
     information: Float64  # [6, 6] for exp(xi) T
+    share: float  # of the source's points that lie on the target's surface
 
 
 def shape_of(frame: Frame, config: TrackingConfig) -> Shape | None:
@@ -117,7 +118,7 @@ def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64
         prior: [6, 6] information of ``T``, for exp(xi) T.
         trust: share of the points that count as independent: sensors err alike in neighbouring pixels.
     """
-    away, H = np.zeros(6), np.zeros((6, 6))
+    away, H, share = np.zeros(6), np.zeros((6, 6)), 0.0
     for step_index in range(_STEPS):
         moved = se3.transform(T, source.points)
         partner = _partners(camera, target, moved)
@@ -127,7 +128,7 @@ def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64
         good = (partner >= 0) & np.isfinite(r) & (np.linalg.norm(p - moved, axis=1) < reach + 0.02 * moved[:, 2])
         if good.sum() < _MIN_POINTS:
             return None
-        n, r, moved = n[good], r[good], moved[good]
+        n, r, moved, share = n[good], r[good], moved[good], float(good.mean())
         deviation = np.maximum(source.sigma[good], 1.4826 * np.median(np.abs(r)))
         weight = robust((r / deviation) ** 2, _SCALE)[0] / deviation**2 * trust
         J = np.concatenate([n, np.cross(moved, n)], axis=1)
@@ -136,4 +137,4 @@ def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64
         T, away = se3.exp(step) @ T, away + step
         if np.abs(step).max() < _STILL:
             break
-    return ShapeFit(se3.orthonormalise(T), H)
+    return ShapeFit(se3.orthonormalise(T), H, share)

@@ -14,14 +14,14 @@ from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Traject
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.initialise import Initialiser
 from sf_tracking.core.keyframes import wants_keyframe
-from sf_tracking.core.locate import Location, Locator
-from sf_tracking.core.patches import to_gray
+from sf_tracking.core.locate import Location, Locator, blind_location
 from sf_tracking.core.search import relocate
 from sf_tracking.core.shape import fit, shape_of
-from sf_tracking.core.update import PatchAlignment, UpdateOperator, View
+from sf_tracking.core.update import UpdateOperator, View, make_operator
 from sf_tracking.core.window import Window
 
 _REGULAR = 1.5  # frame interval relative to the last, up to which frames count as regular
+_SAME_SURFACE = 0.6  # share of depth points that must lie on the keyframe's surface where nothing else tells the pose
 _LONGEST = 3.0  # relative frame interval over which motion is extrapolated at most
 
 
@@ -62,7 +62,7 @@ class Tracker:
 
     def __init__(self, config: TrackingConfig, operator: UpdateOperator | None = None) -> None:
         self._config = config
-        self._operator: UpdateOperator = operator or PatchAlignment(config)
+        self._operator: UpdateOperator = operator or make_operator(config)
         self._locate = Locator(config, self._operator)
         self._window = Window(config, self._operator)
         self._initialiser = Initialiser(config, self._window, self._locate)
@@ -85,12 +85,12 @@ class Tracker:
         """
         camera = self._check(frame)
         assert frame.image is not None
-        view = self._operator.view(to_gray(frame.image))
+        view = self._operator.view(frame.image)
         self._newest = frame.stamp_ns
         if not len(self._window):
             return self._start(frame, view)
         found = self._find(frame.stamp_ns, view, camera)
-        if found is not None and self._config.shape_trust:
+        if self._config.shape_trust and (found is None or found.doubtful):
             found = self._fit_shape(frame, found)
         if found is None:
             self.state = TrackingState.LOST
@@ -163,32 +163,44 @@ class Tracker:
         T_cw = relocate(window, view.gray, camera, self._config)
         return None if T_cw is None else self._locate(window, view, T_cw, wide=False)
 
-    def _fit_shape(self, frame: Frame, found: Location) -> Location:
-        """The pose that also aligns the frame's depth with the newest keyframe's, weighed by both informations."""
-        newest, shape = self._window.keyframes[-1], shape_of(frame, self._config)
-        if shape is None or newest.shape is None:
+    def _fit_shape(self, frame: Frame, found: Location | None) -> Location | None:
+        """The pose that also aligns the frame's depth with the newest keyframe's, weighed by both informations.
+
+        Without patches to rely on (a bare wall) it is the predicted motion that the depth corrects.
+        """
+        newest = self._window.keyframes[-1]
+        shape, known = shape_of(frame, self._config), newest.measured_shape(self._config)
+        if shape is None or known is None:
             return found
-        T = newest.T_cw @ se3.inverse(found.T_cw)
+        blind = found is None
+        base = blind_location(self._predict(frame.stamp_ns)) if found is None else found
+        T = newest.T_cw @ se3.inverse(base.T_cw)
         back = np.linalg.inv(se3.adjoint(T))
-        c, prior = self._config, back.T @ found.information @ back
-        fitted = fit(newest.camera, shape, newest.shape, T, prior, c.shape_trust)
-        return found if fitted is None else replace(found, T_cw=se3.inverse(fitted.T) @ newest.T_cw)
+        fitted = fit(newest.camera, shape, known, T, back.T @ base.information @ back, self._config.shape_trust)
+        if fitted is None or (blind and fitted.share < _SAME_SURFACE):
+            return found
+        return replace(base, T_cw=se3.inverse(fitted.T) @ newest.T_cw)
 
     def _remember(self, frame: Frame, view: View, found: Location) -> tuple[Keyframe, ...]:
-        """Store the frame relative to the newest keyframe, or make it a keyframe and optimise the window."""
+        """Store the frame relative to a keyframe, or make it a keyframe and optimise the window."""
         newest = self._window.keyframes[-1]
         own = found.sights.keyframe == len(self._window) - 1
         flow = np.linalg.norm(found.sights.uv[own] - newest.patches.uv[found.sights.patch[own]], axis=1)
-        keyframe = None
-        if wants_keyframe(self._config, newest, flow, found.overlap):
-            found = self._locate.align(self._window.keyframes, view, found.T_cw, every=True) or found
-            keyframe = self._window.make(frame, view, found.T_cw)
-        if keyframe is None:
-            self._relative[frame.stamp_ns] = (newest.frame.stamp_ns, newest.T_cw @ se3.inverse(found.T_cw))
-            return ()
-        self._window.add(keyframe, found)
-        self._window.optimise()
-        return (self._retire(),) if self._window.full else ()
+        wanted = wants_keyframe(self._config, newest, flow, found.overlap)
+        done = self._window.work()
+        if wanted and not done:
+            self._window.complete()
+        finished = tuple(self._retire() for _ in range((wanted or done) and self._window.full))
+        again, keyframe = None, None
+        if wanted:
+            again = self._locate.align(self._window.keyframes, view, found.T_cw, thorough=True)
+            keyframe = None if again is None else self._window.make(frame, view, again.T_cw)
+        if again is not None and keyframe is not None:
+            self._window.add(keyframe, again)
+        else:
+            anchor = self._window.settled
+            self._relative[frame.stamp_ns] = (anchor.frame.stamp_ns, anchor.T_cw @ se3.inverse(found.T_cw))
+        return finished
 
     def _retire(self) -> Keyframe:
         """The oldest keyframe leaves the window: its pose is final."""

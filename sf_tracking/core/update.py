@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sf_interfaces.errors import ConfigError
 from sf_interfaces.types import Float32, Float64, UInt8
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.align import Templates, align, describe
+from sf_tracking.core.patches import to_gray
 
 _CONTRAST, _MIDDLE = 45.0, 128.0  # grey levels of a normalised image: standard deviation and mean
 _MAX_GAIN = 4.0  # change of contrast between two sights of a patch
@@ -40,15 +42,15 @@ class Update:
 class UpdateOperator(Protocol):
     """Maps patches of keyframes and their reprojections into an image to corrected positions."""
 
-    def view(self, gray: UInt8) -> View:
-        """Prepare an image [H, W] once for all its edges."""
+    def view(self, image: UInt8) -> Any:
+        """Prepare an image, RGB [H, W, 3] or mono [H, W], once for all its edges: a :class:`View` or more."""
         ...
 
-    def describe(self, view: View, uv: Float64) -> Any:
-        """What is kept of the patches at ``uv`` [M, 2] px; has ``take(index)`` and ``concatenate(list)``."""
+    def describe(self, view: Any, uv: Float64) -> Any:
+        """What is kept of the patches at ``uv`` [M, 2] px; has ``take(index)``."""
         ...
 
-    def __call__(self, patches: Any, target: View, start: Float64, warp: Float64) -> Update:
+    def __call__(self, patches: Any, target: Any, start: Float64, warp: Float64) -> Update:
         """Correct E reprojections.
 
         Args:
@@ -58,6 +60,22 @@ class UpdateOperator(Protocol):
             warp: [E, 2, 2] how offsets from the patch centre map into the target.
         """
         ...
+
+
+def make_operator(config: TrackingConfig) -> UpdateOperator:
+    """The operator that the configuration asks for.
+
+    Raises:
+        ConfigError: it is unknown, or its checkpoint does not fit.
+    """
+    if config.operator == "patches":
+        return PatchAlignment(config)
+    if config.operator == "dpvo":
+        # Torch takes seconds to load: only who asks for the network waits for it.
+        from sf_tracking.core.dpvo_operator import DPVOOperator
+
+        return DPVOOperator(config)
+    raise ConfigError(f"tracking.operator '{config.operator}' is unknown; choose patches or dpvo")
 
 
 class PatchAlignment:
@@ -70,8 +88,9 @@ class PatchAlignment:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
 
-    def view(self, gray: UInt8) -> View:
+    def view(self, image: UInt8) -> View:
         """See :class:`UpdateOperator`; changes of exposure do not read as motion in the search either."""
+        gray = to_gray(image)
         mean, deviation = cv2.meanStdDev(gray)
         gain = _CONTRAST / max(float(deviation[0, 0]), 1.0)
         normal = cv2.convertScaleAbs(gray, alpha=gain, beta=_MIDDLE - gain * float(mean[0, 0]))

@@ -3,6 +3,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -13,12 +15,15 @@ from sf_tracking.core.bundle import Problem, adjust, information_root
 from sf_tracking.core.keyframes import TrackedKeyframe, reproject
 from sf_tracking.core.locate import Location, align_sights
 from sf_tracking.core.patches import Measured, Patches, extract
-from sf_tracking.core.shape import fit, shape_of
+from sf_tracking.core.shape import fit
 from sf_tracking.core.update import UpdateOperator, View, search
 
 _GUESS = 0.5  # relative deviation of an inverse depth that is only expected from its neighbours
 _NEIGHBOURS = 5  # known patches whose median a new patch without depth starts from
 _KNOWN = 0.3  # relative deviation up to which a patch counts as known
+_AT_ONCE = 4  # keyframes in which a new one's patches are looked for per frame
+_STEPS_AT_ONCE = 1  # of bundle adjustment per frame
+_DONE = object()
 _RANGE = (1e-3, 50.0)  # of the median inverse depth, within which refined ones are kept
 
 
@@ -29,6 +34,8 @@ class Window:
         self._config = config
         self._operator = operator
         self.keyframes: list[TrackedKeyframe] = []
+        self._parts: Iterator[None] = iter(())
+        self._idle = True
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -38,6 +45,11 @@ class Window:
         """One more keyframe than is optimised: the oldest is final."""
         return len(self.keyframes) > self._config.window
 
+    @property
+    def settled(self) -> TrackedKeyframe:
+        """The newest keyframe whose work is done: its pose hardly moves any more."""
+        return self.keyframes[-1 if self._idle or len(self.keyframes) < 2 else -2]
+
     def make(self, frame: Frame, view: View, T_cw: Float64) -> TrackedKeyframe | None:
         """A keyframe of ``frame`` with new patches, or None where too few places are worth one."""
         uv, found = extract(frame, view.gray, self._config)
@@ -46,8 +58,7 @@ class Window:
         camera = frame.camera
         assert camera is not None
         patches = self._patches(camera, T_cw, uv, found)
-        shape = shape_of(frame, self._config) if self._config.shape_trust else None
-        return TrackedKeyframe(frame, view, patches, self._operator.describe(view, uv), T_cw, shape=shape)
+        return TrackedKeyframe(frame, view, patches, self._operator.describe(view, uv), T_cw)
 
     def _patches(self, camera: Camera, T_cw: Float64, uv: Float64, found: Measured) -> Patches:
         """Patches that start at their measured depth, or at what their neighbours let expect."""
@@ -71,22 +82,59 @@ class Window:
         near = cKDTree(place).query(uv, k=_NEIGHBOURS)[1]
         return np.asarray(np.median(np.concatenate(depths)[near], axis=1))
 
-    def add(self, keyframe: TrackedKeyframe, found: Location) -> None:
-        """Append a keyframe in which the window's patches were seen, and look for its patches in the window."""
+    def add(self, keyframe: TrackedKeyframe, found: Location, fixed: int = 2, iterations: int | None = None) -> None:
+        """Append a keyframe in which the window's patches were seen; the rest of its work is done in parts.
+
+        Args:
+            fixed: how many of the oldest keyframes hold the gauge in the bundle adjustment to come.
+            iterations: of that adjustment; None: as configured.
+        """
+        self.complete()
         stamp, sights = keyframe.frame.stamp_ns, found.sights
         for index, source in enumerate(self.keyframes):
             mine = sights.keyframe == index
             _remember(source, stamp, sights.patch[mine], sights.uv[mine], sights.information[mine])
-        for target in self.keyframes:
-            self._observe(keyframe, target, found.excess)
-        for target in self.keyframes[-self._config.shape_keyframes :]:
-            if keyframe.shape is not None and target.shape is not None:
-                T = target.T_cw @ se3.inverse(keyframe.T_cw)
-                c = self._config
-                found = fit(keyframe.camera, keyframe.shape, target.shape, T, np.eye(6), c.shape_trust)
-                if found is not None:
-                    keyframe.moved[target.frame.stamp_ns] = found
         self.keyframes.append(keyframe)
+        self._idle = False
+        self._parts = self._integrate(keyframe, found, fixed, iterations or self._config.bundle_iterations)
+
+    def work(self) -> bool:
+        """Do the next part of a new keyframe's work; True when nothing is left.
+
+        The parts go to the frames that follow a keyframe, so that it takes hardly longer than any other.
+        """
+        self._idle = next(self._parts, _DONE) is _DONE
+        return self._idle
+
+    def complete(self) -> None:
+        """Do all that is left."""
+        while not self.work():
+            pass
+
+    def _integrate(self, keyframe: TrackedKeyframe, found: Location, fixed: int, iterations: int) -> Iterator[None]:
+        """Look for the patches of a new keyframe in the window, align its surface, adjust the bundle."""
+        others = self.keyframes[:-1]
+        for count, target in enumerate(reversed(others), start=1):
+            self._observe(keyframe, target, found.excess)
+            if count % _AT_ONCE == 0:
+                yield
+        if found.doubtful and self._config.shape_trust and others:
+            self._align_shapes(keyframe, others[-self._config.shape_keyframes :])
+            yield
+        for done in range(0, iterations, _STEPS_AT_ONCE):
+            self.optimise(fixed, min(_STEPS_AT_ONCE, iterations - done))
+            yield
+
+    def _align_shapes(self, keyframe: TrackedKeyframe, others: list[TrackedKeyframe]) -> None:
+        """Relative motions of a keyframe from its measured surface and those of others."""
+        for target in others:
+            source_shape, target_shape = (k.measured_shape(self._config) for k in (keyframe, target))
+            if source_shape is not None and target_shape is not None:
+                T = target.T_cw @ se3.inverse(keyframe.T_cw)
+                trust = self._config.shape_trust
+                moved = fit(keyframe.camera, source_shape, target_shape, T, np.eye(6), trust)
+                if moved is not None:
+                    keyframe.moved[target.frame.stamp_ns] = moved
 
     def _observe(self, source: TrackedKeyframe, target: TrackedKeyframe, excess: float) -> None:
         """Look for the patches of ``source`` in ``target``; over levels where their depth is only guessed."""
@@ -102,7 +150,7 @@ class Window:
         sights = align_sights(self._operator, target.view, 0, source, at, take)
         _remember(source, target.frame.stamp_ns, sights.patch, sights.uv, sights.information / excess)
 
-    def optimise(self, fixed: int = 2, iterations: int | None = None) -> None:
+    def optimise(self, fixed: int, iterations: int) -> None:
         """Bundle adjustment of the window; the ``fixed`` oldest keyframes hold the gauge."""
         keyframes = self.keyframes
         problem = self._problem()
@@ -152,6 +200,7 @@ class Window:
 
     def retire(self) -> TrackedKeyframe:
         """The oldest keyframe leaves: its pose is final."""
+        self.complete()
         oldest = self.keyframes.pop(0)
         for keyframe in self.keyframes:
             keyframe.seen.pop(oldest.frame.stamp_ns, None)

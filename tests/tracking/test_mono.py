@@ -56,7 +56,7 @@ def test_pure_rotation_begins_no_map_but_is_survived_by_one() -> None:
     frames = [room.frame(i, T, "none") for i, T in enumerate(poses)]
     tracker = Tracker(CONFIG)
     updates = [tracker.track(f) for f in frames]
-    assert all(u.state is TrackingState.TRACKING for u in updates[15:])
+    assert all(u.state is TrackingState.TRACKING for u in updates[18:])
     tracker.finish()
     assert trajectory_error(tracker.trajectory(), truth_of(frames, poses)).rmse < 0.02
 

@@ -77,7 +77,7 @@ def test_changes_of_exposure_do_not_read_as_motion() -> None:
 
 def test_black_images_are_lost_and_the_known_place_is_found_again() -> None:
     frames, truth = sequence("sparse", 30)
-    black = [replace(f, image=np.zeros_like(f.image)) for f in frames[18:21]]
+    black = [replace(f, image=np.zeros_like(f.image), sparse_depth=None) for f in frames[18:21]]
     tracker = Tracker(CONFIG)
     states = [tracker.track(f).state for f in (*frames[:18], *black, *frames[21:])]
     assert states[17] is TrackingState.TRACKING
