@@ -10,7 +10,7 @@ DECLARED := pyproject.toml CMakeLists.txt $(wildcard sf_*/CMakeLists.txt sf_*/*/
 	sf_*/package.xml sf_interfaces/msg/*.msg sf_interfaces/srv/*.srv sf_interfaces/tf2_msgs/msg/*.msg \
 	sf_recon/csrc/*)
 
-.PHONY: demo test lint bench clean setup
+.PHONY: demo test lint bench bench-full clean setup
 
 demo: $(READY)
 	$(PY) -m sf_bringup.cli demo
@@ -24,11 +24,15 @@ lint: $(READY)
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
 
-# DATA=folder of the real recordings adds the comparison of completion methods.
+# BENCH is the folder of results, DATA one of real recordings (without it, what needs them is left out).
+BENCH ?= bench
+DATA ?= $(wildcard ../shared/data)
+
 bench: $(READY)
-	$(PY) benchmarks/rasterize.py
-	$(PY) benchmarks/play_record.py
-	$(if $(DATA),$(PY) benchmarks/completion.py --data $(DATA))
+	$(PY) benchmarks/all.py --out $(BENCH) $(if $(DATA),--data $(DATA))
+
+bench-full: $(READY)
+	$(PY) benchmarks/all.py --full --out $(BENCH)-full $(if $(DATA),--data $(DATA))
 
 clean:
 	rm -rf $(VENV) build dist out demo install log .pytest_cache .mypy_cache .ruff_cache .hypothesis

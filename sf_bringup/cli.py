@@ -19,6 +19,17 @@ PASSED_ON = {
     "play": ("sf_bringup.player", "publish a bag, live or lossless"),
     "record": ("sf_bringup.recorder", "record topics to mcap"),
 }
+_EXPORTS = {
+    "tum": "trajectory.tum",
+    "kitti": "trajectory.kitti",
+    "euroc": "trajectory.csv in EuRoC's columns",
+    "ply": "coloured surface and mesh",
+    "glb": "coloured mesh as binary glTF",
+    "depth": "keyframe depth as 16-bit PNG (mm) and NPZ with variance",
+    "colmap": "COLMAP text model with images",
+    "mvsnet": "images, cameras and pairs as MVSNet reads them",
+    "nerfstudio": "transforms.json with images and depth",
+}
 GOALS = ("auto", "tracking", "slam", "recon", "mvd", "completion")
 
 
@@ -30,6 +41,12 @@ def _overrides(pairs: Sequence[str]) -> dict[str, str]:
             raise ConfigError(f"--set {pair}: write it as section.key=value")
         out[key] = value
     return out
+
+
+def _reading(args: argparse.Namespace) -> Any:
+    from sf_interfaces.io.datasets import ReadOptions
+
+    return ReadOptions(skip_bad=args.skip_bad, use_poses=args.use_poses, depth_scale=args.depth_scale)
 
 
 def _print(value: Any, as_json: bool, text: str) -> None:
@@ -50,7 +67,9 @@ def _run(args: argparse.Namespace) -> int:
         config=args.config,
         overrides=_overrides(args.set),
         mapping=_overrides(args.map),
+        use=tuple(args.use),
         rate=args.rate,
+        reading=_reading(args),
     )
     summary = run(request)
     _print(summary.values, args.json, summary.text())
@@ -58,9 +77,19 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def _plan(args: argparse.Namespace) -> int:
-    from sf_bringup.runner import explain
+    from sf_bringup.runner import RunRequest, explain
 
-    value, text = explain(tuple(args.input), args.goal, args.calibration, args.poses, _overrides(args.map))
+    value, text = explain(
+        RunRequest(
+            inputs=tuple(args.input),
+            goal=args.goal,
+            calibration=args.calibration,
+            poses=args.poses,
+            mapping=_overrides(args.map),
+            use=tuple(args.use),
+            reading=_reading(args),
+        )
+    )
     _print(value, args.json, text)
     return 0
 
@@ -68,8 +97,18 @@ def _plan(args: argparse.Namespace) -> int:
 def _convert(args: argparse.Namespace) -> int:
     from sf_bringup.inputs import convert
 
-    summary = convert(args.dataset, args.out)
-    _print({"out": str(args.out), "topics": summary}, args.json, f"wrote {args.out}: {summary}")
+    written, counts = convert(args.dataset, args.out, _reading(args))
+    value = {
+        "out": str(args.out),
+        "dataset": written.dataset,
+        "frames": written.frames,
+        "skipped": written.skipped,
+        "reasons": written.reasons,
+        "notes": list(written.notes),
+        "topics": counts,
+    }
+    topics = ", ".join(f"{count} {name}" for name, count in counts.items())
+    _print(value, args.json, "\n".join([*written.sentences(), f"wrote {args.out}: {topics}"]))
     return 0
 
 
@@ -105,9 +144,10 @@ def _blocks(args: argparse.Namespace) -> int:
 def _doctor(args: argparse.Namespace) -> int:
     from sf_bringup.doctor import checks
 
-    rows = checks()
-    value = [{"check": c.name, "ok": c.ok, "detail": c.detail} for c in rows]
-    _print(value, args.json, "\n".join(f"{'ok  ' if c.ok else 'FAIL'} {c.name}: {c.detail}" for c in rows))
+    rows = checks(args.seconds)
+    value = [{"check": c.name, "ok": c.ok, "detail": c.detail, "mend": c.mend} for c in rows]
+    lines = [f"{'ok  ' if c.ok else 'FAIL'} {c.name}: {c.detail}{f'; {c.mend}' if c.mend else ''}" for c in rows]
+    _print(value, args.json, "\n".join(lines))
     return 0 if all(c.ok for c in rows) else 2
 
 
@@ -120,7 +160,7 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from sf_bringup.products import render_views
+    from sf_bringup.looking import render_views
 
     count = render_views(args.run, args.poses, args.out)
     _print({"views": count}, args.json, f"wrote {count} views to {args.out}")
@@ -128,41 +168,64 @@ def _render(args: argparse.Namespace) -> int:
 
 
 def _view(args: argparse.Namespace) -> int:
-    from sf_bringup.products import view
+    from sf_bringup.looking import view
 
-    view(args.run)
+    view(args.run, args.host, args.port, lambda url: _print({"url": url}, args.json, f"{url}   (Ctrl-C ends)"))
     return 0
 
 
 def _export(args: argparse.Namespace) -> int:
-    from sf_bringup.products import export
+    from sf_bringup.export import export
 
-    written = export(args.run, args.out, tum=args.tum, kitti=args.kitti, ply=args.ply)
-    _print([str(p) for p in written], args.json, "\n".join(f"wrote {p}" for p in written))
+    wanted = [name for name in _EXPORTS if getattr(args, name)]
+    written, left_out = export(args.run, args.out, wanted, args.frame)
+    lines = [*(f"wrote {p}" for p in written), *(f"no {name}: {why}" for name, why in left_out.items())]
+    _print({"written": [str(p) for p in written], "left_out": left_out}, args.json, "\n".join(lines))
     return 0
 
 
 def _eval(args: argparse.Namespace) -> int:
-    from sf_bringup.measures import MEASURES
+    from sf_bringup.eval_command import eval_command
 
-    value = MEASURES[args.measure](args)
-    _print(value, args.json, "\n".join(f"{key:18} {number}" for key, number in value.items()))
-    return 0
+    return eval_command(args)
 
 
 def _report(args: argparse.Namespace) -> int:
+    from sf_bringup.bench_report import is_run, write_bench_page
+    from sf_bringup.run_folder import RunFolder
     from sf_bringup.summary import summarise, write_page
 
-    summary = summarise(args.run)
+    if not is_run(args.run):
+        page = write_bench_page(args.run)
+        _print({"report": str(page)}, args.json, f"wrote {page}")
+        return 0
+    summary = summarise(RunFolder.open(args.run))
     write_page(summary)
     _print(summary.values, args.json, summary.text())
     return 0
 
 
+def _add_reading(parser: argparse.ArgumentParser) -> None:
+    """How a data set is read."""
+    parser.add_argument("--skip-bad", action="store_true", help="leave out frames whose files are bad, and count them")
+    parser.add_argument("--use-poses", action="store_true", help="its poses are input, not only a reference")
+    parser.add_argument("--depth-scale", type=float, metavar="N", help="stored depth units in a metre, if not its own")
+
+
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("dataset", type=Path)
+    parser.add_argument("out", type=Path)
+    _add_reading(parser)
+
+
 def _add_input(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "input", nargs="+", type=Path, help="bag (.mcap, .db3, .bag, rosbag2 folder) or data set folder"
+        "input",
+        nargs="+",
+        type=Path,
+        help="bag (.mcap, .db3, .bag, rosbag2 folder), data set folder, folder of photos, or video",
     )
+    _add_reading(parser)
     parser.add_argument("--goal", choices=GOALS, default="auto")
     parser.add_argument("--calibration", type=Path, help="camera.yaml in ROS camera_info format")
     parser.add_argument("--poses", type=Path, help="given poses, TUM format, T_map_camera")
@@ -173,6 +236,21 @@ def _add_input(parser: argparse.ArgumentParser) -> None:
         metavar="ROLE=TOPIC",
         help="take this topic as rgb, depth, lidar or pose",
     )
+    parser.add_argument("--use", action="append", default=[], metavar="BLOCK", help="prefer this block (sf blocks)")
+
+
+def _add_export(p: argparse.ArgumentParser) -> None:
+    p.add_argument("run", type=Path)
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--frame", choices=("camera", "base_link", "lidar"), default="camera", help="whose trajectory")
+    for form, what in _EXPORTS.items():
+        p.add_argument(f"--{form}", action="store_true", help=what)
+
+
+def _add_view(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("run", type=Path)
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: this machine only)")
+    parser.add_argument("--port", type=int, default=8080)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -201,9 +279,7 @@ def build_parser() -> argparse.ArgumentParser:
     for name, (_, help) in PASSED_ON.items():
         verbs.add_parser(name, help=help, add_help=False)
 
-    p = verb("convert", _convert, "write a data set as an mcap bag")
-    p.add_argument("dataset", type=Path)
-    p.add_argument("out", type=Path)
+    _add_convert(verb("convert", _convert, "write a data set as an mcap bag"))
 
     p = verb("simulate", _simulate, "write a bag with exact ground truth from a procedural scene")
     from sf_bringup.simulate_command import add_arguments
@@ -211,7 +287,8 @@ def build_parser() -> argparse.ArgumentParser:
     add_arguments(p)
 
     verb("blocks", _blocks, "list the installed blocks")
-    verb("doctor", _doctor, "check the installation and the machine")
+    p = verb("doctor", _doctor, "check the installation, the machine and the live topics")
+    p.add_argument("--seconds", type=float, default=3.0, help="listen to live topics this long (0: not at all)")
     p = verb("demo", _demo, "simulate, play, record, measure: the whole system in one command")
     p.add_argument("--out", type=Path, default=Path("demo"))
     p.add_argument("--engine", choices=("inproc", "ros"), default="ros")
@@ -220,20 +297,18 @@ def build_parser() -> argparse.ArgumentParser:
     p.add_argument("run", type=Path)
     p.add_argument("--poses", type=Path, required=True, help="T_map_camera in TUM format")
     p.add_argument("--out", type=Path, required=True)
-    verb("view", _view, "show the surface of a finished run").add_argument("run", type=Path)
+    _add_view(verb("view", _view, "serve a page that shows the map of a finished run"))
 
-    p = verb("export", _export, "write the results of a run in other formats")
-    p.add_argument("run", type=Path)
-    p.add_argument("--out", type=Path, required=True)
-    for form in ("tum", "kitti", "ply"):
-        p.add_argument(f"--{form}", action="store_true")
+    p = verb("export", _export, "write the results of a run in other formats; without a format: all it has")
+    _add_export(p)
 
-    p = verb("eval", _eval, "measure a run against its reference")
-    p.add_argument("measure", choices=("traj", "depth", "completion", "render"))
-    p.add_argument("run", type=Path)
-    p.add_argument("--reference", type=Path, help="TUM trajectory (default: /ground_truth/pose of the input)")
-    p.add_argument("--holdout", type=float, default=0.5, help="fraction of LiDAR points to predict (completion)")
-    verb("report", _report, "write report.html and the picture of a run").add_argument("run", type=Path)
+    from sf_bringup import eval_command
+
+    p = verbs.add_parser("eval", help="measure a run or plain files against a reference")
+    p.set_defaults(action=_eval)
+    eval_command.add_arguments(p)
+    p = verb("report", _report, "write report.html of a run, or of a folder of benchmark results")
+    p.add_argument("run", type=Path, help="folder of a run, or of JSON files")
     return parser
 
 

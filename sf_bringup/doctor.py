@@ -1,4 +1,4 @@
-"""``sf doctor``: is everything installed that the lines need, and can processes on this machine talk?"""
+"""``sf doctor``: is everything there that the lines need, can processes talk, and what do the topics say?"""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -8,81 +8,138 @@ import os
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, entry_points, version
+from pathlib import Path
 
+from sf_bringup.shared_memory import orphaned_segments
 from sf_interfaces.blocks import load_blocks
+from sf_interfaces.errors import SceneFactoryError
+
+_VERSIONED = ("scenefactory", "ros-jazzy-rclpy", "ros-jazzy-rmw-fastrtps-cpp", "torch", "numpy", "open3d", "mcap")
+_MODELS = ("matchers", "monodepth", "covariance", "update_operators")  # entry-point groups scenefactory.*
+_WANTED_SHM_MB = 512
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One finding; ``detail`` says what was found, or what to do."""
+    """One finding: what was found, whether that is well, and how to mend it ("" where nothing is to be done)."""
 
     name: str
     ok: bool
     detail: str
+    mend: str = ""
 
 
-def _import(module: str, remedy: str) -> Callable[[], Check]:
+def _versions() -> Check:
+    found = {}
+    for name in _VERSIONED:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not a wheel"
+    return Check("versions", True, ", ".join(f"{name} {number}" for name, number in found.items()))
+
+
+def _import(module: str) -> Callable[[], Check]:
     def check() -> Check:
         try:
             importlib.import_module(module)
         except ImportError as error:
-            return Check(module, False, f"{error}; {remedy}")
+            return Check(module, False, str(error), "run make in the checkout, or reinstall the package")
         return Check(module, True, "imports")
 
     return check
-
-
-def _ros() -> Check:
-    try:
-        import rclpy
-
-        rclpy.init()
-        node = rclpy.create_node("sf_doctor")
-        names = node.get_node_names()
-        node.destroy_node()
-        rclpy.try_shutdown()
-    except Exception as error:  # whatever stops DDS is the finding
-        return Check("ros graph", False, f"{error}; install the RMW: pip install 'ros-jazzy-rclpy[fastrtps]'")
-    domain = os.environ.get("ROS_DOMAIN_ID", "0")
-    others = sorted(n for n in names if n != "sf_doctor")
-    return Check("ros graph", True, f"domain {domain}, other nodes: {', '.join(others) or 'none'}")
 
 
 def _shared_memory() -> Check:
     """Images of VGA size and more go through /dev/shm; a small one silently halves the rate."""
     if not os.path.isdir("/dev/shm"):
         return Check(
-            "shared memory",
-            False,
-            "/dev/shm is missing: images go over UDP and are slow; mount a tmpfs there",
+            "shared memory", False, "/dev/shm is missing: images go over UDP and are slow", "mount a tmpfs there"
         )
-    free = shutil.disk_usage("/dev/shm").free // 2**20
-    return Check("shared memory", free > 512, f"{free} MB free in /dev/shm (512 MB wanted for large messages)")
+    usage = shutil.disk_usage("/dev/shm")
+    detail = f"{usage.free >> 20} of {usage.total >> 20} MB free in /dev/shm"
+    if usage.free >> 20 < _WANTED_SHM_MB:
+        mend = f"make it larger ({_WANTED_SHM_MB} MB wanted): mount -o remount,size=1g /dev/shm, docker --shm-size=1g"
+        return Check("shared memory", False, detail, mend)
+    return Check("shared memory", True, detail)
+
+
+def _orphans() -> Check:
+    """Segments of processes that were killed take shared memory until somebody removes them."""
+    found = orphaned_segments()
+    size = sum(p.stat().st_size for p in found if p.exists()) >> 20
+    if found:
+        mend = "any sf up or sf run removes them at its end; or now: python -m sf_bringup.shared_memory"
+        return Check("orphaned segments", size < _WANTED_SHM_MB, f"{len(found)} of dead processes, {size} MB", mend)
+    return Check("orphaned segments", True, "none")
 
 
 def _blocks() -> Check:
-    specs = load_blocks()
-    return Check("blocks", bool(specs), ", ".join(s.id for s in specs) or "none installed; reinstall with make")
+    try:
+        specs = load_blocks()
+    except (SceneFactoryError, ImportError, AttributeError) as error:
+        return Check("blocks", False, str(error), "uninstall the package that provides the broken block")
+    return Check("blocks", bool(specs), ", ".join(s.id for s in specs) or "none installed", "" if specs else "run make")
+
+
+def _models() -> Check:
+    found = [f"{group[:-1]} {p.name}" for group in _MODELS for p in entry_points(group=f"scenefactory.{group}")]
+    return Check(
+        "optional models", True, ", ".join(sorted(found)) or "none installed; the training-free defaults serve"
+    )
 
 
 def _torch() -> Check:
     import torch
 
-    where = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+    where = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU (no CUDA device)"
     return Check("torch", True, f"{version('torch')} on {where}, {torch.get_num_threads()} threads")
 
 
-def checks() -> list[Check]:
-    """All findings, in the order in which problems should be mended."""
-    remedy = "run make in the checkout, or reinstall the package"
+def _middleware() -> Check:
+    try:
+        import rclpy
+        from rclpy.utilities import get_rmw_implementation_identifier
+
+        context = rclpy.Context()
+        rclpy.init(context=context)
+        node = rclpy.create_node("sf_doctor", context=context)
+        name = get_rmw_implementation_identifier()
+        node.destroy_node()
+        rclpy.try_shutdown(context=context)
+    except Exception as error:  # whatever stops DDS is the finding
+        return Check("middleware", False, str(error), "install the RMW: pip install 'ros-jazzy-rclpy[fastrtps]'")
+    domain, reach = os.environ.get("ROS_DOMAIN_ID", "0"), os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    profile = os.environ.get("FASTRTPS_DEFAULT_PROFILES_FILE", "")
+    if profile and not Path(profile).is_file():
+        return Check(
+            "middleware", False, f"{name}, profile {profile} is missing", "unset FASTRTPS_DEFAULT_PROFILES_FILE"
+        )
+    return Check("middleware", True, f"{name}, domain {domain}, discovery {reach}")
+
+
+def checks(seconds: float = 3.0) -> list[Check]:
+    """All findings, in the order in which problems should be mended.
+
+    Args:
+        seconds: how long to listen to the live topics; 0: not at all.
+    """
     tests = [
-        _import("sf_interfaces.msg", remedy),
-        _import("tf2_msgs.msg", remedy),
-        _import("sf_recon._native", remedy),
+        _versions,
+        _import("sf_interfaces.msg"),
+        _import("tf2_msgs.msg"),
+        _import("sf_recon._native"),
         _torch,
         _blocks,
+        _models,
         _shared_memory,
-        _ros,
+        _orphans,
+        _middleware,
     ]
-    return [test() for test in tests]
+    found = [test() for test in tests]
+    if seconds > 0 and found[-1].ok:
+        from sf_bringup.doctor_topics import topic_checks
+
+        found += topic_checks(seconds)
+    return found

@@ -102,7 +102,8 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
     Raises:
         SceneFactoryError: a process died, refused its configuration, or the line hangs.
     """
-    line = launches(made, given.mapping.roles, config, lossless=rate == 0, out=str(folder.path.resolve()))
+    out, compressed = str(folder.path.resolve()), given.mapping.compressed
+    line = launches(made, given.mapping.roles, config, lossless=rate == 0, out=out, compressed=compressed)
     environment = node_environment()
     logs = folder.path / "log"
     with _parent_node() as node:
@@ -119,8 +120,7 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
             graph.stop()
             _finish_recording(recorder)
         finally:
-            graph.stop()
-            stop_all(helpers, interrupt_s=2.0)
+            stop_all([*graph.processes, *helpers])  # at once: each may take its whole patience
     for sentence in watch.errors:
         print(f"sf: {sentence}", file=sys.stderr)
     return {}

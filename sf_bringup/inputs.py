@@ -3,86 +3,70 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-import yaml
-
+from sf_bringup.progress import Progress
+from sf_interfaces import topics
 from sf_interfaces.errors import CalibrationError, FormatError
-from sf_interfaces.io.bag import BagReader, is_bag
-from sf_interfaces.io.datasets import recognise
+from sf_interfaces.geometry.undistort import Distortion
+from sf_interfaces.io import datasets
+from sf_interfaces.io.bag import BagReader, RawMessage, is_bag
+from sf_interfaces.io.datasets import ReadOptions, Written
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
-from sf_interfaces.types import Camera, Float64, check_pose
+from sf_interfaces.types import Camera, Float64
+
+PROBE = 3  # frames of a data set (messages per topic of a bag) that tell what a line would get
 
 
-def convert(dataset: Path, out: Path) -> dict[str, int]:
-    """Write a data set folder as one mcap bag; returns messages per topic.
+def convert(dataset: Path, out: Path, options: ReadOptions) -> tuple[Written, dict[str, int]]:
+    """Write a data set as one mcap bag; returns what became of it and messages per topic.
+
+    The file gets its name only when it is whole.
 
     Raises:
-        FormatError: no such folder, or its layout is not known.
+        SceneFactoryError: no such folder, its layout is not known, or a file of it is bad.
     """
-    if not dataset.exists():
-        raise FormatError(f"{dataset} does not exist; give a bag file or a data set folder")
-    recognised = recognise(dataset)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    with SequenceWriter(out) as writer:
-        recognised.write(writer)
+    recognised = datasets.recognise(dataset, options.depth_scale)
+    with _whole(out) as unfinished, SequenceWriter(unfinished) as writer, Progress("reading", "frames") as progress:
+        written = datasets.write(recognised, writer, options, progress.update)
     with BagReader(out) as reader:
-        return {name: info.count for name, info in sorted(reader.topics.items())}
+        return written, {name: info.count for name, info in sorted(reader.topics.items())}
 
 
-def resolve(inputs: tuple[Path, ...], out: Path) -> Path:
+@dataclass(frozen=True, slots=True)
+class Resolved:
+    """The bag to play, how it was read (one sentence each), and the goal that suits it (``auto``: any)."""
+
+    bag: Path
+    notes: tuple[str, ...] = ()
+    goal: str = "auto"
+
+
+def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolved:
     """The bag to play: the input itself, or the data set converted to ``out/input.mcap``.
 
     Raises:
-        FormatError: nothing there, several inputs, or an unknown layout.
+        SceneFactoryError: nothing there, several inputs, an unknown layout, or a bad file.
     """
     if len(inputs) != 1:
         raise FormatError(f"give exactly one input, got {len(inputs)}: {', '.join(map(str, inputs))}")
     path = inputs[0]
     if not path.exists():
-        raise FormatError(f"{path} does not exist; give a bag file or a data set folder")
+        raise FormatError(f"{path} does not exist; give a bag, a data set folder, a folder of photos or a video")
     if is_bag(path):
-        return path
+        return Resolved(path)
     converted = out / "input.mcap"
-    convert(path, converted)
-    return converted
-
-
-def read_camera(path: Path) -> Camera:
-    """Intrinsics from a YAML file in ROS camera_calibration format, without distortion.
-
-    Raises:
-        CalibrationError: unreadable, a key is missing, or the camera has distortion.
-    """
-    try:
-        values = yaml.safe_load(path.read_text())
-        k = [float(v) for v in values["camera_matrix"]["data"]]
-        distortion = values.get("distortion_coefficients", {}).get("data", [])
-        if np.any(np.asarray(distortion, dtype=np.float64) != 0):
-            raise CalibrationError(
-                f"{path} has distortion; record it in the bag's camera_info, where images are undistorted"
-            )
-        name = str(values.get("camera_name", "camera_optical_frame"))
-        size = int(values["image_width"]), int(values["image_height"])
-        return Camera(*size, k[0], k[4], k[2] + 0.5, k[5] + 0.5, name)
-    except (OSError, yaml.YAMLError, KeyError, TypeError, IndexError, ValueError) as error:
-        raise CalibrationError(
-            f"cannot read calibration {path} ({error!r}); it needs image_width, image_height and camera_matrix.data"
-        ) from error
-
-
-def read_extrinsic(path: Path) -> Float64:
-    """T_camera_lidar [4, 4] from a text file of 4x4 numbers.
-
-    Raises:
-        CalibrationError: unreadable or not a rigid motion.
-    """
-    try:
-        return check_pose(np.loadtxt(path), f"extrinsic {path}")
-    except (OSError, ValueError, FormatError) as error:
-        raise CalibrationError(f"cannot read T_camera_lidar from {path}: {error}; give 4 rows of 4 numbers") from error
+    written, _ = convert(path, converted, options)
+    notes = written.sentences()
+    if written.goal != "auto":
+        notes.append(f"{written.dataset}: frames without an order in time, so they are for goal {written.goal}")
+    return Resolved(converted, tuple(notes), written.goal)
 
 
 def with_given(
@@ -91,35 +75,74 @@ def with_given(
     *,
     image_topic: str,
     camera: Camera | None,
+    distortion: Distortion | None = None,
     poses: Path | None,
     extrinsic: tuple[str, str, Float64] | None,
+    limit: int | None = None,
 ) -> Path:
     """A copy of the bag that also carries what the user gave beside it, so that every engine sees the same.
 
     Args:
         image_topic: the stream that ``camera`` belongs to.
-        camera: published beside every image on the image's namespace, replacing camera_info there.
+        camera, distortion: published beside every image on the image's namespace, replacing camera_info there.
         poses: TUM file, published as /sf/pose.
         extrinsic: (camera frame, lidar frame, T_camera_lidar), published on /tf_static.
+        limit: copy only the first so many messages of each topic.
 
     Returns:
         The new bag ``out/input_with_given.mcap``, or ``bag`` itself when nothing was given.
+
+    Raises:
+        CalibrationError: the images are not of the size of the given camera.
+        FormatError: the poses cannot be read.
     """
     if camera is None and poses is None and extrinsic is None:
         return bag
     target = out / "input_with_given.mcap"
     info_topic = image_topic.rsplit("/", 1)[0] + "/camera_info"
-    with BagReader(bag) as reader, SequenceWriter(target) as writer:
+    with _whole(target) as unfinished, BagReader(bag) as reader, SequenceWriter(unfinished) as writer:
         if extrinsic is not None:
             writer.tf_static(*extrinsic, stamp_ns=reader.start_ns)
         if poses is not None:
-            given = read_tum(poses)
-            for stamp, T in zip(given.stamps_ns.tolist(), given.poses, strict=True):
-                writer.pose("/sf/pose", stamp, T, "map")
-        for raw in reader.messages():
+            trajectory = read_tum(poses)
+            for stamp, T in zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True):
+                writer.pose(topics.GIVEN_POSE.name, stamp, T, "map")
+        for raw in _messages(reader, limit):
             if camera is not None and raw.topic == info_topic:
                 continue
             writer.bag.write(raw.topic, raw.type, raw.stamp_ns, raw.data)
             if camera is not None and raw.topic == image_topic:
-                writer.camera_info(info_topic, raw.stamp_ns, camera)
+                own = _of_stream(camera, reader.decode(raw), bag)
+                writer.camera_info(info_topic, raw.stamp_ns, own, distortion)
     return target
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Where to write a file that gets its name only when it is whole (and may replace the one being read)."""
+    unfinished = path.with_name(f"{path.stem}.unfinished{path.suffix}")
+    try:
+        yield unfinished
+        unfinished.rename(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def _messages(reader: BagReader, limit: int | None) -> Iterator[RawMessage]:
+    if limit is None:
+        yield from reader.messages()
+    else:
+        for topic in sorted(reader.topics):
+            yield from islice(reader.messages([topic]), limit)
+
+
+def _of_stream(camera: Camera, image: Any, bag: Path) -> Camera:
+    """The given camera in the frame of an image message, whose size it must have (a compressed one does not say)."""
+    expected = camera.width, camera.height
+    width, height = getattr(image, "width", expected[0]), getattr(image, "height", expected[1])
+    if (width, height) != expected:
+        raise CalibrationError(
+            f"--calibration is for {camera.width}x{camera.height}, but the images of {bag} are {width}x{height}; "
+            "give the calibration that belongs to this stream"
+        )
+    return replace(camera, frame_id=image.header.frame_id.lstrip("/"))

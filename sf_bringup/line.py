@@ -3,9 +3,10 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.node import Node
 
 from sf_bringup.launcher import Process, node_command, stop_all
+from sf_bringup.shared_memory import sweep_shared_memory
 from sf_bringup.wiring import NodeLaunch
 from sf_interfaces.errors import ConfigError, SceneFactoryError
 
@@ -29,12 +31,16 @@ _TRANSITIONS = (
 _BACK_OFF_S = (1.0, 2.0, 4.0)  # before each of the at most three restarts
 
 
+_HEALTHY_S = 60.0  # a node that has run this long has recovered: its earlier deaths are forgotten
+
+
 @dataclass(slots=True)
 class _Running:
     launch: NodeLaunch
     process: Process
     restarts: int = 0
     restart_at: float | None = None
+    since: float = 0.0
 
 
 class Line:
@@ -74,10 +80,12 @@ class Line:
         stop_all([self._running.pop(n).process for n in stopped])
         started = [n for n in plan if n not in self._running]
         for name in started:
-            self._running[name] = _Running(plan[name], self._spawn(plan[name]))
+            self._running[name] = _Running(plan[name], self._spawn(plan[name]), since=time.monotonic())
         self._running = {n: self._running[n] for n in plan}
-        # Consumers first: when a head becomes active, everybody downstream already listens.
-        for name in reversed(started):
+        # A replay waits for nobody: everybody downstream has to listen before its head becomes active. A live
+        # head is wanted soon, and its keyframes are kept for those that come later.
+        replay = any(launch.parameters.get("lossless") for launch in plan.values())
+        for name in reversed(started) if replay else started:
             self.bring_up(name)
         return started, stopped
 
@@ -112,35 +120,67 @@ class Line:
         return {n: code for n, r in self._running.items() if (code := r.process.poll()) is not None}
 
     def supervise(self, now: float) -> list[str]:
-        """Restart nodes that died, with growing pauses and at most three times each; returns what was done.
+        """Restart nodes that died, with growing pauses and at most three times in a row; returns what was done.
+
+        A node goes on from its last snapshot. One that keeps dying is given up with all nodes after it: the
+        line goes on without them.
 
         Raises:
-            SceneFactoryError: a node keeps dying.
+            SceneFactoryError: the first node of the line keeps dying, so nothing is left.
         """
         said = []
         for name, code in self.dead().items():
-            running = self._running[name]
+            running = self._running.get(name)
+            if running is None:
+                continue  # given up a moment ago together with the node before it
+            if now - running.since > _HEALTHY_S and running.restart_at is None:
+                running.restarts = 0
             if running.restarts >= len(_BACK_OFF_S):
-                raise SceneFactoryError(
-                    f"node {name} died {running.restarts + 1} times, last with exit code {code}; "
-                    f"see {running.process.log}"
-                )
-            if running.restart_at is None:
+                said.append(self._give_up(name, code))
+            elif running.restart_at is None:
                 running.restart_at = now + _BACK_OFF_S[running.restarts]
-                said.append(f"node {name} died with exit code {code}, restart in {_BACK_OFF_S[running.restarts]:g} s")
+                said.append(f"node {name} {_ended(code)}, restart in {_BACK_OFF_S[running.restarts]:g} s")
             elif now >= running.restart_at:
-                running.restarts, running.restart_at = running.restarts + 1, None
-                running.process = self._spawn(running.launch)
-                self.bring_up(name)
-                said.append(f"node {name} restarted")
+                said.append(self._restart(name, running, now))
         return said
 
-    def stop(self) -> None:
-        """End all nodes; they are gone when this returns."""
+    def _restart(self, name: str, running: _Running, now: float) -> str:
+        sweep_shared_memory()
+        running.restarts, running.restart_at, running.since = running.restarts + 1, None, now
+        running.process = self._spawn(running.launch, resume=True)
+        try:
+            self.bring_up(name)
+        except SceneFactoryError as error:
+            stop_all([running.process])  # the next look counts it as another death
+            return f"node {name} did not come back: {error}"
+        return f"node {name} restarted"
+
+    def _give_up(self, name: str, code: int) -> str:
+        """Stop a node that keeps dying and everything downstream of it."""
+        names = list(self._running)
+        lost = names[names.index(name) :]
+        why = f"node {name} died {self._running[name].restarts + 1} times in a row, last it {_ended(code)}"
+        log = self._running[name].process.log
+        stop_all([self._running.pop(n).process for n in lost])
+        if not self._running:
+            raise SceneFactoryError(f"{why}; see {log}")
+        return f"{why}; the line goes on without {', '.join(lost)}; see {log}"
+
+    def stop(self, save_s: float = 0.0) -> None:
+        """End all nodes; they are gone when this returns, and so is the shared memory of those that were killed.
+
+        Args:
+            save_s: how long live nodes may take to write their results; 0: no longer than a moment.
+        """
+        if save_s:
+            stop_all(self.processes, interrupt_s=save_s)
         stop_all(self.processes)
         self._running.clear()
+        sweep_shared_memory()
 
-    def _spawn(self, launch: NodeLaunch) -> Process:
+    def _spawn(self, launch: NodeLaunch, *, resume: bool = False) -> Process:
+        if resume:
+            launch = replace(launch, parameters={**launch.parameters, "resume": True})
         log = self._folder / f"{launch.name}.log"
         # What follows the sensors can catch up later; the head cannot, and so goes first where cores are scarce.
         nice = 0 if launch.head else _NICE
@@ -164,3 +204,7 @@ class Line:
             return future.result() if future.done() else None
         finally:
             self._node.destroy_client(client)
+
+
+def _ended(code: int) -> str:
+    return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"

@@ -1,47 +1,72 @@
-"""``sf eval``: the measures of a finished run against the references its input carries."""
+"""The measures of a finished run against the references its input carries, or against given files."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sf_bringup.discovery import DENSE_FRACTION
+from sf_bringup.eval_files import DEPTH_SUFFIXES, files_by_name, read_depth, read_surface, read_trajectory
 from sf_bringup.evaluation import (
     DepthError,
+    SurfaceError,
     TrajectoryError,
+    align_trajectories,
     depth_error,
     mean_depth_error,
     psnr,
+    ssim,
+    surface_error,
     trajectory_error,
 )
+from sf_bringup.evaluation.image import Lpips
+from sf_bringup.evaluation.mesh import icp
+from sf_bringup.evaluation.robust_mvd import mvd_error
 from sf_bringup.run_folder import RunFolder
 from sf_interfaces import topics
 from sf_interfaces.errors import FormatError
+from sf_interfaces.geometry import se3
 from sf_interfaces.io.bag import BagReader
-from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.ros.messages import decode_depth, decode_image, decode_pose, to_ns
-from sf_interfaces.types import DepthMap, Trajectory, UInt8
+from sf_interfaces.types import DepthMap, Float64, Scale, Trajectory, UInt8
 
 GROUND_TRUTH_POSE = topics.GROUND_TRUTH_PREFIX + "pose"
 GROUND_TRUTH_DEPTH = topics.GROUND_TRUTH_PREFIX + "depth/image"
+NOVEL_POSE = topics.GROUND_TRUTH_PREFIX + "novel/pose"  # views off the path, which only a simulation has
+NOVEL_IMAGE = topics.GROUND_TRUTH_PREFIX + "novel/image"
 HELD_OUT_VIEWS = 10  # views rendered per run: enough for a stable median, seconds to compute
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOutView:
+    """A view that the map was not made from."""
+
+    stamp_ns: int
+    rendered: UInt8  # [H, W, 3]
+    real: UInt8  # [H, W, 3]
+    surface: np.ndarray  # [H, W] where the map has a surface
+
+
+def _poses(bag: Path, topic: str) -> Trajectory | None:
+    """The poses of one topic, or None where the bag does not have it."""
+    with BagReader(bag) as reader:
+        if topic not in reader.topics:
+            return None
+        pairs = {}
+        for raw in reader.messages([topic]):
+            stamp, _, T = decode_pose(reader.decode(raw))
+            pairs[stamp] = T
+    return Trajectory.from_pairs(list(pairs.items()))
 
 
 def reference_trajectory(bag: Path) -> Trajectory | None:
     """The poses under /ground_truth/pose of a bag, or None where it has none."""
-    with BagReader(bag) as reader:
-        if GROUND_TRUTH_POSE not in reader.topics:
-            return None
-        pairs = {}
-        for raw in reader.messages([GROUND_TRUTH_POSE]):
-            stamp, _, T = decode_pose(reader.decode(raw))
-            pairs[stamp] = T
-    return Trajectory.from_pairs(list(pairs.items()))
+    return _poses(bag, GROUND_TRUTH_POSE)
 
 
 def decoded(bag: Path, topic: str, decode: Callable[[Any], Any], stamps: set[int]) -> Iterator[tuple[int, Any]]:
@@ -68,26 +93,77 @@ def input_bag(run: RunFolder) -> Path:
     return bag
 
 
-def measure_trajectory(run: RunFolder, reference: Path | None = None) -> TrajectoryError:
-    """ATE of the final poses of all frames.
+def truth_of(run: RunFolder, reference: Path | None = None) -> Trajectory:
+    """The reference trajectory: a file, or the poses of the input.
+
+    Raises:
+        FormatError: there is none.
+    """
+    truth = read_trajectory(reference) if reference else reference_trajectory(input_bag(run))
+    if truth is None:
+        raise FormatError(f"the input has no {GROUND_TRUTH_POSE}; pass --reference traj.tum")
+    return truth
+
+
+def _into_truth(run: RunFolder, truth: Trajectory) -> tuple[float, Float64]:
+    """Scale and motion from the run's map into that of the truth; where poses were given the two are one."""
+    if not (run.path / "trajectory.tum").is_file():
+        return 1.0, np.eye(4)
+    aligned = align_trajectories(run.trajectory(), truth)
+    return aligned.scale, aligned.T_reference_estimate
+
+
+def measure_trajectory(
+    run: RunFolder, reference: Path | None = None, alignment: str | None = None, delta: int = 1
+) -> TrajectoryError:
+    """ATE and RPE of the final poses of all frames.
 
     Raises:
         FormatError: there is no reference.
     """
-    truth = read_tum(reference) if reference else reference_trajectory(input_bag(run))
-    if truth is None:
-        raise FormatError(f"the input has no {GROUND_TRUTH_POSE}; pass --reference traj.tum")
-    return trajectory_error(run.trajectory(), truth)
+    return trajectory_error(run.trajectory(), truth_of(run, reference), alignment=alignment, delta=delta)
 
 
-def measure_depth(run: RunFolder) -> DepthError:
-    """Keyframe depth against /ground_truth/depth/image of the input, mean over keyframes."""
+def depth_pairs(run: RunFolder, reference: Path | None = None) -> Iterator[tuple[int, DepthMap, DepthMap]]:
+    """(stamp, estimated, true depth) of keyframes that have both; ``reference``: a folder of <stamp>.npz or .png."""
     maps = dict(run.depth_maps())
-    truth = decoded(input_bag(run), GROUND_TRUTH_DEPTH, decode_depth, set(maps))
-    errors = [depth_error(maps[stamp], reference) for stamp, reference in truth]
+    if reference is None:
+        truth = decoded(input_bag(run), GROUND_TRUTH_DEPTH, decode_depth, set(maps))
+    else:
+        files = files_by_name(reference, DEPTH_SUFFIXES)
+        named = {int(name): path for name, path in files.items() if name.isdigit()}
+        truth = ((stamp, read_depth(named[stamp])) for stamp in sorted(maps) if stamp in named)
+    for stamp, known in truth:
+        yield stamp, maps[stamp], known
+
+
+def measure_depth(run: RunFolder, reference: Path | None = None, alignment: str | None = None) -> DepthError:
+    """Keyframe depth against its reference, mean over keyframes.
+
+    Args:
+        alignment: see :func:`sf_bringup.evaluation.depth.align_depth`; None: median where the run's scale is
+            arbitrary, else none.
+    """
+    alignment = alignment or default_depth_alignment(run)
+    errors = [depth_error(found, truth, alignment) for _, found, truth in depth_pairs(run, reference)]
     if not errors:
         raise FormatError(f"the input has no {GROUND_TRUTH_DEPTH} for the keyframes of this run")
     return mean_depth_error(errors)
+
+
+def measure_mvd(run: RunFolder, reference: Path | None = None, alignment: str | None = None) -> dict[str, float]:
+    """RobustMVD's numbers of the run's depth with all the views it used, mean over keyframes."""
+    alignment = alignment or default_depth_alignment(run)
+    errors = [
+        mvd_error(np.where(found.valid, found.z, 0.0), np.where(truth.valid, truth.z, 0.0), alignment)
+        for _, found, truth in depth_pairs(run, reference)
+    ]
+    return {name: float(np.mean([getattr(e, name) for e in errors])) for name in ("absrel", "inlier", "density")}
+
+
+def default_depth_alignment(run: RunFolder) -> str:
+    """``median`` for depth in arbitrary units, ``none`` for metres."""
+    return "median" if run.scale is Scale.ARBITRARY else "none"
 
 
 def measure_completion(run: RunFolder, holdout: float, seed: int = 0) -> DepthError:
@@ -128,6 +204,27 @@ def measure_completion(run: RunFolder, holdout: float, seed: int = 0) -> DepthEr
     return mean_depth_error(errors)
 
 
+def measure_mesh(run: RunFolder, reference: Path, with_icp: bool = False) -> dict[str, SurfaceError]:
+    """The run's mesh, or its surface points where it has none, against a reference mesh in the map of the truth.
+
+    The reconstruction is brought into that map by the alignment of the trajectories (with scale where the
+    run's is arbitrary), then by ICP if wanted.
+
+    Returns:
+        ``nice_culled``: within the frusta of the true trajectory; ``nicer_unculled``: all of both surfaces.
+    """
+    file = next((p for p in (run.path / "mesh.ply", run.path / "surface.ply") if p.is_file()), None)
+    if file is None:
+        raise FormatError(f"{run.path} holds neither mesh.ply nor surface.ply; run with --goal recon")
+    truth, given = truth_of(run), read_surface(reference)
+    scale, T_truth_map = _into_truth(run, truth)
+    surface = read_surface(file).moved(T_truth_map, scale)
+    if with_icp:
+        surface = surface.moved(icp(surface, given))
+    views = (run.camera(), truth.poses)
+    return {"nice_culled": surface_error(surface, given, views), "nicer_unculled": surface_error(surface, given)}
+
+
 def held_out_stamps(run: RunFolder) -> list[int]:
     """Evenly spread frames that are not keyframes: the colour field has never seen them."""
     known = {int(s) for s in run.keyframes().stamps_ns}
@@ -137,40 +234,77 @@ def held_out_stamps(run: RunFolder) -> list[int]:
     return free[::step][:HELD_OUT_VIEWS]
 
 
-def render_held_out(run: RunFolder) -> list[tuple[int, UInt8, UInt8, np.ndarray]]:
-    """(stamp, rendered, real, surface mask) of the held-out views at their estimated poses."""
+def render_held_out(run: RunFolder) -> list[HeldOutView]:
+    """Interpolated views: frames between keyframes, drawn at their estimated poses."""
+    topic = run.info()["topics"].get("rgb")
+    stamps = held_out_stamps(run)
+    if not stamps or topic is None:
+        return []
+    trajectory = run.trajectory()
+    return _render(run, topic, dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)), set(stamps))
+
+
+def render_novel(run: RunFolder) -> list[HeldOutView]:
+    """Extrapolated views: true views off the path, brought into the run's map by the trajectories' alignment.
+
+    Raises:
+        FormatError: the input has no such views.
+    """
+    bag = input_bag(run)
+    novel, truth = _poses(bag, NOVEL_POSE), reference_trajectory(bag)
+    if novel is None or truth is None:
+        raise FormatError(f"the input has no {NOVEL_IMAGE}; only a simulation with --novel-views has it")
+    scale, T_truth_map = _into_truth(run, truth)
+    poses = se3.inverse(T_truth_map) @ novel.poses
+    poses[:, :3, 3] /= scale
+    stamps = novel.stamps_ns.tolist()
+    return _render(run, NOVEL_IMAGE, dict(zip(stamps, poses, strict=True)), set(stamps))
+
+
+def _render(run: RunFolder, topic: str, pose_of: dict[int, Float64], stamps: set[int]) -> list[HeldOutView]:
     from sf_bringup.pipeline import load_map
 
-    stamps = held_out_stamps(run)
-    trajectory = run.trajectory()
-    pose_of = dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True))
-    topic = run.info()["topics"].get("rgb")
-    if not stamps or topic is None or not run.map.is_file():
+    if not run.map.is_file():
         return []
     field, camera, out = load_map(run.map), run.camera(), []
-    for stamp, image in decoded(input_bag(run), topic, decode_image, set(stamps)):
+    for stamp, image in decoded(input_bag(run), topic, decode_image, stamps):
         view = field.render(camera, pose_of[stamp])
-        out.append((stamp, view.image, image, view.depth.valid))
+        real = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
+        out.append(HeldOutView(stamp, view.image, real, view.depth.valid))
     return out
 
 
-def render_scores(views: list[tuple[int, UInt8, UInt8, np.ndarray]]) -> dict[str, float]:
-    """Median PSNR over the surface and over the whole image, and the fraction of pixels with a surface."""
+def render_scores(views: list[HeldOutView]) -> dict[str, Any]:
+    """Medians over views of PSNR (surface, whole image), SSIM and LPIPS (whole image), and the surface's share."""
     if not views:
         raise FormatError("no held-out frame to render: the run has no colour field or every frame is a keyframe")
-    real = [r if r.ndim == 3 else np.repeat(r[..., None], 3, axis=2) for _, _, r, _ in views]
-    surface = [psnr(v[1], r, v[3]) for v, r in zip(views, real, strict=True) if v[3].any()]
+    surface = [psnr(v.rendered, v.real, v.surface) for v in views if v.surface.any()]
     return {
         "psnr_surface": float(np.median(surface)) if surface else float("nan"),
-        "psnr_full": float(np.median([psnr(v[1], r) for v, r in zip(views, real, strict=True)])),
-        "covered": 100 * float(np.mean([v[3].mean() for v in views])),
-        "views": float(len(views)),
+        **image_scores([(v.rendered, v.real) for v in views]),
+        "covered": 100 * float(np.mean([v.surface.mean() for v in views])),
+        "views": len(views),
     }
 
 
-MEASURES: dict[str, Callable[[argparse.Namespace], dict[str, float]]] = {
-    "traj": lambda a: measure_trajectory(RunFolder.open(a.run), a.reference).as_dict(),
-    "depth": lambda a: measure_depth(RunFolder.open(a.run)).as_dict(),
-    "completion": lambda a: measure_completion(RunFolder.open(a.run), a.holdout).as_dict(),
-    "render": lambda a: render_scores(render_held_out(RunFolder.open(a.run))),
-}
+def image_scores(pairs: list[tuple[UInt8, UInt8]]) -> dict[str, Any]:
+    """Medians of PSNR, SSIM and LPIPS (in words why not, where its weights are missing)."""
+    scores: dict[str, Any] = {
+        "psnr_full": float(np.median([psnr(a, b) for a, b in pairs])),
+        "ssim": float(np.median([ssim(a, b) for a, b in pairs])),
+    }
+    try:
+        lpips = Lpips.find()
+        scores["lpips_alex"] = float(np.median([lpips(a, b) for a, b in pairs]))
+    except FormatError as error:
+        scores["lpips_alex"] = f"not measured: {error}"
+    return scores
+
+
+def measure_render(run: RunFolder) -> dict[str, Any]:
+    """Scores of interpolated views, and of extrapolated ones (or why there are none)."""
+    try:
+        extrapolated: Any = render_scores(render_novel(run))
+    except FormatError as error:
+        extrapolated = f"not measured: {error}"
+    return {**render_scores(render_held_out(run)), "extrapolated": extrapolated}

@@ -28,8 +28,11 @@ from sf_interfaces.errors import ConfigError, PlanError, SceneFactoryError
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.qos import qos_profile
 
-_LOOK_S = 0.5  # between two looks at the graph
-_SETTLE_S = 2.0  # topics must have stayed the same this long before the line is planned anew
+HOSTS = "hosts"  # section of the configuration: node -> host that runs it with --only
+_LOOK_S = 0.25  # between two looks at the graph
+_SETTLE_S = 1.0  # topics must have stayed the same this long before the line is planned anew
+_SAVE_S = 60.0  # at the end, for the map and the trajectory to be written
+_GONE_S = 30.0  # an input of the running line may be silent this long (a driver restarts) before the line changes
 
 
 class Orchestrator(Node):
@@ -41,13 +44,31 @@ class Orchestrator(Node):
         config: sections that become node parameters.
         folder: logs and, when the line ends, results.
         replay: nodes drop nothing (a lossless player feeds the line).
+        use: blocks preferred whatever their cost.
+        only: nodes to run on this host; empty: all that ``hosts`` of the configuration does not place elsewhere.
+
+    Raises:
+        ConfigError: an unknown section or node name.
     """
 
     def __init__(
-        self, goal: str, user: dict[str, str], config: ConfigFile, folder: Path, *, replay: bool = False
+        self,
+        goal: str,
+        user: dict[str, str],
+        config: ConfigFile,
+        folder: Path,
+        *,
+        replay: bool = False,
+        use: Sequence[str] = (),
+        only: Sequence[str] = (),
     ) -> None:
-        super().__init__("sf_orchestrator")
+        super().__init__("_".join(["sf_orchestrator", *only]))
+        config.check_sections({spec.name for spec in load_blocks()} | {"sync", HOSTS})
         self._goal, self._user, self._config, self._folder, self._replay = goal, user, config, folder, replay
+        self._use, self._only = tuple(use), frozenset(only)
+        self._elsewhere = frozenset(config.sections.get(HOSTS, {})) - self._only
+        self._inputs: frozenset[str] = frozenset()  # topics the running line takes in
+        self._last_seen: dict[str, tuple[str, float]] = {}
         self._line = Line(self, folder / "log", node_environment())
         self._probes: dict[str, Probe] = {}
         self._probing: dict[str, Any] = {}
@@ -67,7 +88,7 @@ class Orchestrator(Node):
             SceneFactoryError: a node does not come up or keeps dying.
         """
         now = time.monotonic()
-        types = self._topics()
+        types = self._present(now)
         if types != self._seen:
             self._seen, self._changed_at = types, now
         self._probe(types)
@@ -79,8 +100,8 @@ class Orchestrator(Node):
             self.get_logger().warning(sentence)
 
     def stop(self) -> None:
-        """End all nodes."""
-        self._line.stop()
+        """End all nodes, when they have written their results."""
+        self._line.stop(_SAVE_S)
 
     # ---- inside
 
@@ -89,8 +110,21 @@ class Orchestrator(Node):
         return {
             name: kinds[0]
             for name, kinds in self.get_topic_names_and_types()
-            if discovery.is_input(name) and kinds[0] in discovery.ROLES.values() and self.count_publishers(name)
+            if discovery.is_input(name) and discovery.is_wanted(kinds[0]) and self.count_publishers(name)
         }
+
+    def _present(self, now: float) -> dict[str, str]:
+        """The input topics, and for a while those of the running line that have vanished."""
+        found = self._topics()
+        self._last_seen |= {name: (kind, now) for name, kind in found.items()}
+        waited = {
+            name: kind
+            for name, (kind, seen) in self._last_seen.items()
+            if name in self._inputs and name not in found and now - seen < _GONE_S
+        }
+        for name in waited:
+            self._say(f"{name} is gone; the line waits {_GONE_S:g} s for it to come back")
+        return found | waited
 
     def _probe(self, types: dict[str, str]) -> None:
         """Ask each new image topic for one message; drop probes of topics that went away."""
@@ -106,9 +140,7 @@ class Orchestrator(Node):
 
     def _probed(self, name: str) -> Any:
         def take(msg: Any) -> None:
-            depth = messages.is_depth_encoding(msg.encoding)
-            fraction = messages.decode_depth(msg).density if depth else 1.0
-            self._probes[name] = Probe(msg.encoding, msg.header.frame_id, fraction)
+            self._probes[name] = discovery.probe(msg)
 
         return take
 
@@ -117,19 +149,25 @@ class Orchestrator(Node):
         try:
             user = {role: topic for role, topic in self._user.items() if topic in types}
             mapping = discovery.discover(types, self._probes, user)
-            made = plan(mapping.available, self._goal, load_blocks())
-            wanted = launches(made, mapping.roles, self._config, lossless=self._replay, out=str(self._folder.resolve()))
+            made = plan(mapping.available, self._goal, load_blocks(), self._use)
+            wanted = launches(
+                made, mapping.roles, self._config,
+                lossless=self._replay, out=str(self._folder.resolve()), compressed=mapping.compressed,
+            )  # fmt: skip
         except PlanError as error:
             self._say(f"no line: {error}")
             self._line.apply(())
-            self.plan = None
+            self.plan, self._inputs = None, frozenset()
             self._publish(None, str(error))
             return
         self._explain(mapping, made)
-        started, stopped = self._line.apply(wanted)
-        self.plan = made
+        started, stopped = self._line.apply(launch for launch in wanted if self._is_here(launch.name))
+        self.plan, self._inputs = made, frozenset(mapping.roles.values())
         self._publish(made, "active")
         self._say(f"started {', '.join(started) or 'nothing'}, stopped {', '.join(stopped) or 'nothing'}")
+
+    def _is_here(self, name: str) -> bool:
+        return name in self._only if self._only else name not in self._elsewhere
 
     def _explain(self, mapping: InputMapping, made: Plan) -> None:
         self._say("\n".join([*mapping.reasons, made.explain()]))
@@ -165,7 +203,7 @@ class Orchestrator(Node):
         def answer(request: Any, response: Any) -> Any:
             try:
                 mapping = discovery.discover(self._topics(), self._probes, self._user)
-                made = plan(mapping.available, request.goal or self._goal, load_blocks())
+                made = plan(mapping.available, request.goal or self._goal, load_blocks(), self._use)
                 response.line, response.message = self._message(made, "planned"), made.explain()
             except SceneFactoryError as error:
                 response.message = str(error)
@@ -182,6 +220,12 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--config", type=Path)
     parser.add_argument("--set", action="append", default=[], metavar="SECTION.KEY=VALUE")
     parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument(
+        "--use", action="append", default=[], metavar="BLOCK", help="prefer this block, see 'sf blocks'"
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="NODE", help="run only these nodes of the line on this host"
+    )
     parser.add_argument("--replay", action="store_true", help="drop nothing: a lossless player feeds the line")
     return parser.parse_args(args)
 
@@ -203,7 +247,10 @@ def main(args: Sequence[str] | None = None) -> int:
         given = parse(args)
         config = ConfigFile.load(given.config, _pairs(given.set, "--set"))
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        node = Orchestrator(given.goal, _pairs(given.map, "--map"), config, given.out, replay=given.replay)
+        node = Orchestrator(
+            given.goal, _pairs(given.map, "--map"), config, given.out,
+            replay=given.replay, use=given.use, only=given.only,
+        )  # fmt: skip
         try:
             while not stopping:
                 node.step()

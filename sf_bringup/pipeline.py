@@ -6,6 +6,7 @@ The ROS graph runs the same cores on the same data; on a lossless replay both gi
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from importlib.metadata import entry_points
@@ -21,15 +22,15 @@ from sf_bringup.progress import Progress
 from sf_bringup.result_writer import ResultWriter
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import sync_values
-from sf_interfaces.blocks import BlockSpec, Quantity
+from sf_interfaces.blocks import BlockSpec, Quantity, load_blocks
 from sf_interfaces.config import ConfigFile, build
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.io.bag import BagReader
-from sf_interfaces.io.cloud import write_surface
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import write_tum
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.sync import SyncConfig
+from sf_interfaces.timing import Timings
 from sf_interfaces.types import Float64, Frame, Keyframe, Scale, Trajectory
 
 PARTS_GROUP = "scenefactory.parts"
@@ -62,21 +63,24 @@ class ProductionLine:
 
     def __init__(self, blocks: Sequence[str], config: ConfigFile, writer: ResultWriter, *, posed: bool) -> None:
         parts = {block: make_part(block, config) for block in blocks}
-        self._flexion = parts.get("flexion")
-        self.tracker = parts.get("tracking")
+        owner = {quantity: s.id for s in load_blocks() if s.id in parts for quantity in s.provides}
+        self._flexion = parts.get(owner.get(Quantity.IMAGE, ""))
+        self._tracker_id = owner.get(Quantity.POSE, "")
+        self.tracker = parts.get(self._tracker_id)
         self._completer = parts.get("depth:complete")
         self._posed_depth = "depth:posed" in blocks
         self._sequence = parts.get("depth:slam") or parts.get("depth:posed")
         self.reconstruction = parts.get("recon")
         self._writer, self._config, self._epoch = writer, config, 0
-        writer.posed = "tracking" in blocks or posed
+        self.timings = Timings()
+        writer.posed = self.tracker is not None or posed
         self.keyframe_poses: list[tuple[int, Float64]] = []
 
     def in_epoch(self, epoch: int) -> None:
         """A backward jump of time ends one sequence and begins another: the tracker starts anew."""
         if self.tracker is not None and epoch != self._epoch:
             self._finish_keyframes(self.tracker.finish().keyframes)
-            self.tracker = make_part("tracking", self._config)
+            self.tracker = make_part(self._tracker_id, self._config)
         if self._sequence is not None and epoch != self._epoch:
             self._densified(self._sequence.finish())
         self._epoch = epoch
@@ -92,7 +96,8 @@ class ProductionLine:
             self._writer.flexion(frame, image)
             frame = replace(frame, image=image)
         if self.tracker is not None:
-            update = self.tracker.track(frame)
+            with self.timings.measure("tracking"):
+                update = self.tracker.track(frame)
             self._writer.tracked(frame, update)
             self._finish_keyframes(update.keyframes)
             return update.T_map_camera if update.scale is Scale.METRIC else None
@@ -132,7 +137,8 @@ class ProductionLine:
             self._densified(self._sequence.add(keyframe))
             return
         if self._completer is not None:
-            keyframe = self._completer.complete(keyframe)
+            with self.timings.measure("depth"):
+                keyframe = self._completer.complete(keyframe)
             self._writer.dense(keyframe)
         self._reconstruct(keyframe)
 
@@ -146,7 +152,9 @@ class ProductionLine:
 
     def _reconstruct(self, keyframe: Keyframe) -> None:
         if self.reconstruction is not None:
-            self._writer.surface(keyframe.stamp_ns, self.reconstruction.add(keyframe))
+            with self.timings.measure("recon"):
+                added = self.reconstruction.add(keyframe)
+            self._writer.surface(keyframe.stamp_ns, added)
 
 
 def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float) -> dict[str, int]:
@@ -233,7 +241,9 @@ def _advance(line: ProductionLine, inputs: SensorInputs) -> int:
     done = 0
     for frame in inputs.assembler.ready():
         line.in_epoch(inputs.assembler.epoch)
-        inputs.assembler.feed_back(frame.stamp_ns, line.step(frame))
+        with line.timings.measure("frame"):
+            pose = line.step(frame)
+        inputs.assembler.feed_back(frame.stamp_ns, pose)
         done += 1
     return done
 
@@ -250,12 +260,12 @@ def _head_spec(made: Plan) -> BlockSpec:
 
 
 def _save(folder: RunFolder, line: ProductionLine, writer: ResultWriter) -> None:
-    """The files that the nodes of the graph write at their end."""
+    """The files that the nodes of the graph write at their end, and where the time went."""
+    (folder.path / "timing.json").write_text(json.dumps(line.timings.to_dict()))
     if line.tracker is not None:
         trajectory = line.tracker.trajectory()
         write_tum(folder.path / "trajectory.tum", trajectory)
         write_tum(folder.path / "keyframes.tum", Trajectory.from_pairs(line.keyframe_poses, trajectory.scale))
         writer.path(trajectory)
     if line.reconstruction is not None:
-        line.reconstruction.save(folder.map)
-        write_surface(folder.path / "surface.ply", line.reconstruction.surface())
+        line.reconstruction.save_products(folder.path)

@@ -22,10 +22,10 @@ from typing import Any
 from sf_bringup.credits import Credits
 from sf_interfaces.errors import ConfigError, FormatError, SceneFactoryError
 from sf_interfaces.io.bag import BagReader, RawMessage
-from sf_interfaces.ros.messages import rclpy_factory, to_ns, to_stamp
+from sf_interfaces.ros.messages import COMPRESSED_IMAGE, rclpy_factory, to_ns, to_stamp
 from sf_interfaces.topics import CLOCK, GROUND_TRUTH_PREFIX, stream
 
-_IMAGE = "sensor_msgs/msg/Image"
+_IMAGES = ("sensor_msgs/msg/Image", COMPRESSED_IMAGE)
 _TICK_NS = 10_000_000  # of simulated time between two /clock messages
 _SETTLE_S = 1.0  # matched subscribers must have stopped changing for this long
 _GONE_S = 10.0
@@ -85,7 +85,7 @@ def choose_head(bag: BagReader, options: PlayOptions) -> str | None:
     names = sorted(
         t.name
         for t in bag.topics.values()
-        if t.type == _IMAGE
+        if t.type in _IMAGES
         and t.count
         and not t.name.startswith(GROUND_TRUTH_PREFIX)
         and (options.topics is None or t.name in options.topics)

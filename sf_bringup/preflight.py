@@ -16,7 +16,7 @@ from sf_interfaces.blocks import Quantity
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.io.bag import BagReader, RawMessage
 from sf_interfaces.ros.frames import FrameTree
-from sf_interfaces.ros.messages import decode_depth, decode_tf, is_depth_encoding
+from sf_interfaces.ros.messages import decode_tf
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +40,7 @@ def _probe(reader: BagReader, topic: str) -> Probe | None:
     raw = _first(reader, topic)
     if raw is None:
         return None
-    message = reader.decode(raw)
-    encoding = getattr(message, "encoding", "")
-    fraction = decode_depth(message).density if encoding and is_depth_encoding(encoding) else 1.0
-    return Probe(encoding, message.header.frame_id.lstrip("/"), fraction)
+    return discovery.probe(reader.decode(raw))
 
 
 def _static_frames(reader: BagReader) -> FrameTree:

@@ -1,7 +1,8 @@
 """Record topics into an mcap bag: serialised bytes are written as they come, nothing is decoded.
 
 Log time is the time of reception on the node's clock (simulated time with ``--use-sim-time``). The file is
-finished on SIGINT and SIGTERM; after SIGKILL everything but the last second is readable.
+finished on SIGINT and SIGTERM; after SIGKILL, or on a full disk, everything but the last second is readable.
+What the network or a slow disk loses is counted per topic and said.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -19,8 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
+from sf_bringup.bag_metadata import write_bag_metadata
 from sf_interfaces.errors import ConfigError, FormatError, SceneFactoryError
 from sf_interfaces.io.mcap_writer import McapWriter, qos_yaml
 from sf_interfaces.ros.messages import rclpy_factory
@@ -66,26 +66,38 @@ class _Item:
 
 
 class WriterThread:
-    """Writes to disk beside the executor, which only enqueues. Drops, counted, beyond the backlog."""
+    """Writes to disk beside the executor, which only enqueues. Drops, counted, beyond the backlog.
 
-    def __init__(self, writer: McapWriter):
-        self._writer = writer
+    Args:
+        backlog: bytes that may wait for the disk.
+    """
+
+    def __init__(self, writer: McapWriter, backlog: int = _BACKLOG_BYTES):
+        self._writer, self._backlog = writer, backlog
         self._items: queue.SimpleQueue[_Item | None] = queue.SimpleQueue()
         self._waiting = 0
         self._lock = threading.Lock()
         self.dropped: Counter[str] = Counter()
-        self.error: BaseException | None = None
+        self.error: OSError | None = None
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
         self._thread.start()
 
     def put(self, item: _Item) -> None:
         """Hand over one message."""
         with self._lock:
-            if self._waiting + len(item.data) > _BACKLOG_BYTES or self.error is not None:
-                self.dropped[item.topic] += 1
+            # One message may be larger than the whole backlog; alone it passes.
+            full = self._waiting and self._waiting + len(item.data) > self._backlog
+            if full or self.error is not None:
+                self.lost(item.topic, 1, "the disk is too slow" if self.error is None else "the disk failed")
                 return
             self._waiting += len(item.data)
         self._items.put(item)
+
+    def lost(self, topic: str, count: int, why: str) -> None:
+        """Count messages that are not in the file, and say so at the first of a topic."""
+        if not self.dropped[topic]:
+            print(f"recorder: losing messages of {topic}: {why}", file=sys.stderr, flush=True)
+        self.dropped[topic] += count
 
     def _run(self) -> None:
         flushed = time.monotonic()
@@ -108,6 +120,11 @@ class WriterThread:
                     flushed = time.monotonic()
         except OSError as error:
             self.error = error
+            self.dropped.update(self._writer.unwritten)
+            while not self._items.empty():
+                waiting = self._items.get()
+                if waiting is not None:
+                    self.dropped[waiting.topic] += 1
 
     def finish(self) -> None:
         """Write what waits and stop."""
@@ -139,7 +156,7 @@ class Recorder:
         from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
         try:
-            message = rclpy_factory(kind)
+            rclpy_factory(kind)
         except FormatError as error:
             self._refused.add(topic)
             print(f"recorder: leaving out {topic}: {error}", file=sys.stderr, flush=True)
@@ -151,18 +168,47 @@ class Recorder:
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        profiles = qos_yaml(reliable, latched)
-        clock = self._node.get_clock()
-
-        def take(data: bytes, info: dict[str, Any]) -> None:
-            stamp = clock.now().nanoseconds
-            published = int(info.get("source_timestamp", 0))
-            if self._options.use_sim_time or published <= 0:
-                published = stamp
-            self._sink.put(_Item(topic, kind, stamp, published, profiles, bytes(data)))
-
-        self._subscriptions[topic] = self._node.create_subscription(message, topic, take, qos, raw=True)
+        self._subscriptions[topic] = _Intake(self._node, self._sink, topic, kind, qos, self._options.use_sim_time)
         print(f"recorder: recording {topic} ({kind})", file=sys.stderr, flush=True)
+
+
+class _Intake:
+    """One subscription: takes serialised messages as fast as they come, and notices those that never came."""
+
+    def __init__(self, node: Any, sink: WriterThread, topic: str, kind: str, qos: Any, sim_time: bool) -> None:
+        from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+        self._node, self._sink, self._topic, self._kind, self._sim_time = node, sink, topic, kind, sim_time
+        self._profiles = qos_yaml(
+            qos.reliability == ReliabilityPolicy.RELIABLE, qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        )
+        self._sequence = 0  # of the publisher's messages, where there is one publisher
+        self._subscription = node.create_subscription(rclpy_factory(kind), topic, self._take, qos, raw=True)
+
+    def _take(self, data: bytes, info: dict[str, Any]) -> None:
+        self._put(data, info)
+        # The executor looks at everything between two messages; at thousands a second they have to be taken at once.
+        while True:
+            with self._subscription.handle:
+                taken = self._subscription.handle.take_message(self._subscription.msg_type, True)
+            if taken is None:
+                return
+            self._put(*taken)
+
+    def _put(self, data: bytes, info: dict[str, Any]) -> None:
+        stamp = self._node.get_clock().now().nanoseconds
+        published = int(info.get("source_timestamp", 0))
+        if self._sim_time or published <= 0:
+            published = stamp
+        self._count_gap(int(info.get("publication_sequence_number") or 0))
+        self._sink.put(_Item(self._topic, self._kind, stamp, published, self._profiles, bytes(data)))
+
+    def _count_gap(self, sequence: int) -> None:
+        """Numbers of several publishers interleave and say nothing; a publisher that starts again begins at 1."""
+        missing = sequence - self._sequence - 1
+        if self._sequence and missing > 0 and self._node.count_publishers(self._topic) == 1:
+            self._sink.lost(self._topic, missing, "they did not arrive in time")
+        self._sequence = sequence
 
 
 def _strings(path: Path) -> dict[str, str]:
@@ -174,46 +220,6 @@ def _strings(path: Path) -> dict[str, str]:
     if not isinstance(values, dict):
         raise FormatError(f"metadata {path} must hold one JSON object")
     return {k: v if isinstance(v, str) else json.dumps(v) for k, v in values.items()}
-
-
-def write_bag_metadata(folder: Path, writer: McapWriter) -> None:
-    """rosbag2's metadata.yaml beside a finished file."""
-    count = sum(writer.counts.values())
-    start, duration = (
-        {"nanoseconds_since_epoch": writer.start_ns},
-        {"nanoseconds": writer.end_ns - writer.start_ns},
-    )
-    kinds = {channel.topic: channel for channel in writer.channels}
-    topics = [
-        {
-            "topic_metadata": {
-                "name": topic,
-                "type": writer.type_of(topic),
-                "serialization_format": "cdr",
-                "offered_qos_profiles": yaml.safe_load(channel.metadata["offered_qos_profiles"]) or [],
-                "type_description_hash": "",
-            },
-            "message_count": writer.counts[topic],
-        }
-        for topic, channel in kinds.items()
-    ]
-    file = {"path": writer.path.name, "starting_time": start, "duration": duration, "message_count": count}
-    information = {
-        "version": 9,
-        "storage_identifier": "mcap",
-        "duration": duration,
-        "starting_time": start,
-        "message_count": count,
-        "topics_with_message_count": topics,
-        "compression_format": "",
-        "compression_mode": "",
-        "relative_file_paths": [writer.path.name],
-        "files": [file],
-        "custom_data": None,
-        "ros_distro": "jazzy",
-    }
-    text = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
-    (folder / "metadata.yaml").write_text(text)
 
 
 def _finish(writer: McapWriter, options: RecordOptions) -> None:
@@ -273,7 +279,10 @@ def record(options: RecordOptions) -> dict[str, Any]:
         rclpy.try_shutdown(context=context)
         sink.finish()
     if sink.error is not None:
-        raise FormatError(f"cannot write {path}: {sink.error}; free disk space")
+        raise FormatError(
+            f"cannot write {path}: {sink.error.strerror}; {sum(sink.dropped.values())} messages after that are lost, "
+            "what was written before is readable; free disk space"
+        )
     _finish(writer, options)
     seconds = max((writer.end_ns - writer.start_ns) / 1e9, 1e-9)
     topics = {

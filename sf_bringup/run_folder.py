@@ -16,8 +16,8 @@ from sf_interfaces import topics
 from sf_interfaces.errors import FormatError
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.trajectory import read_tum
-from sf_interfaces.ros.messages import decode_camera_info, decode_depth, decode_variance, to_ns
-from sf_interfaces.types import Camera, DepthMap, Trajectory
+from sf_interfaces.ros.messages import decode_camera_info, decode_depth, decode_pose, decode_variance, to_ns
+from sf_interfaces.types import Camera, DepthMap, Scale, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +52,17 @@ class RunFolder:
         loaded: dict[str, Any] = json.loads((self.path / "run.json").read_text())
         return loaded
 
+    def timing(self) -> dict[str, dict[str, Any]] | None:
+        """Stage -> seconds, calls, median_ms, each_ms; None where the run did not measure them."""
+        path = self.path / "timing.json"
+        return json.loads(path.read_text()) if path.is_file() else None
+
+    @property
+    def scale(self) -> Scale:
+        """Metric where depth, a LiDAR or poses were given; images alone leave the unit of length open."""
+        metric = {"depth", "lidar", "pose"} & self.info()["topics"].keys()
+        return Scale.METRIC if metric else Scale.ARBITRARY
+
     def trajectory(self) -> Trajectory:
         """Final pose of every frame, T_map_camera.
 
@@ -61,20 +72,44 @@ class RunFolder:
         path = self.path / "trajectory.tum"
         if not path.is_file():
             raise FormatError(f"{path} is missing: this run estimated no poses")
-        return read_tum(path)
+        return read_tum(path, self.scale)
 
     def keyframes(self) -> Trajectory:
         """Final pose of every keyframe, T_map_camera."""
-        return read_tum(self.path / "keyframes.tum")
+        return read_tum(self.path / "keyframes.tum", self.scale)
+
+    def keyframe_poses(self) -> Trajectory:
+        """T_map_camera of every keyframe, estimated or given.
+
+        Raises:
+            FormatError: this run had neither.
+        """
+        if (self.path / "keyframes.tum").is_file():
+            return self.keyframes()
+        pairs = []
+        with BagReader(self.result) as reader:
+            if topics.KEYFRAME_POSE.name in reader.topics:
+                for raw in reader.messages([topics.KEYFRAME_POSE.name]):
+                    stamp, _, T = decode_pose(reader.decode(raw))
+                    pairs.append((stamp, T))
+        if not pairs:
+            raise FormatError(f"{self.path} has no keyframe poses: this run estimated none and was given none")
+        return Trajectory.from_pairs(pairs, self.scale)
 
     def depth_maps(self) -> Iterator[tuple[int, DepthMap]]:
         """Depth with variance of each keyframe, by stamp."""
         for path in sorted((self.path / "depth").glob("*.npz")):
             with np.load(path) as data:
-                yield int(path.stem), DepthMap(data["z"], data.get("variance"))
+                yield int(path.stem), DepthMap(data["z"], data.get("variance"), self.scale)
 
     def camera(self) -> Camera:
-        """The camera of the run."""
+        """The camera of the run.
+
+        Raises:
+            FormatError: no keyframe was made, so there is none.
+        """
+        if not (self.path / "camera.yaml").is_file():
+            raise FormatError(f"{self.path} has no camera.yaml: the run made no keyframe")
         values = yaml.safe_load((self.path / "camera.yaml").read_text())
         k = values["camera_matrix"]["data"]
         width, height = values["image_width"], values["image_height"]

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import json
 import platform
+import sys
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,14 @@ from sf_bringup.planner import Plan, plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.run_folder import RunFolder, unpack
 from sf_bringup.summary import Summary, summarise, write_page
+from sf_interfaces import topics
 from sf_interfaces.blocks import load_blocks
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import ConfigError
+from sf_interfaces.io.calibration import read_camera, read_extrinsic
+from sf_interfaces.io.datasets import ReadOptions
+from sf_interfaces.types import Float64
 
-SECTIONS = {"tracking", "depth", "recon", "flexion", "sync"}
 _VERSIONED = (
     "scenefactory",
     "numpy",
@@ -51,7 +55,9 @@ class RunRequest:
     config: Path | None = None
     overrides: Mapping[str, str] = field(default_factory=dict)
     mapping: Mapping[str, str] = field(default_factory=dict)
+    use: tuple[str, ...] = ()
     rate: float = 0.0
+    reading: ReadOptions = field(default_factory=ReadOptions)
 
 
 def versions() -> dict[str, str]:
@@ -65,42 +71,61 @@ def versions() -> dict[str, str]:
     return found
 
 
-def prepare(request: RunRequest) -> BagInput:
-    """The bag to play, with everything the user gave beside it, checked.
+def prepare(request: RunRequest) -> tuple[BagInput, inputs.Resolved]:
+    """The bag to play, with everything the user gave beside it, checked; and where it comes from.
 
     Raises:
         SceneFactoryError: one sentence about what is wrong with the input.
     """
     request.out.mkdir(parents=True, exist_ok=True)
-    bag = inputs.resolve(request.inputs, request.out)
-    given = preflight.inspect(bag, request.mapping)
-    if request.calibration is None and request.poses is None and request.extrinsic is None:
-        return given
-    leader = given.mapping.roles.get("rgb", given.mapping.roles.get("depth", ""))
-    extrinsic = None
-    if request.extrinsic is not None:
-        if "lidar" not in given.mapping.roles:
-            raise ConfigError(f"--extrinsic {request.extrinsic}: the input has no LiDAR to place")
-        frame = given.frames["rgb" if "rgb" in given.frames else "depth"]
-        extrinsic = (frame, given.frames["lidar"], inputs.read_extrinsic(request.extrinsic))
-    camera = None if request.calibration is None else inputs.read_camera(request.calibration)
+    source = inputs.resolve(request.inputs, request.out, request.reading)
+    mapping = dict(request.mapping)
+    if request.reading.use_poses and source.bag in request.inputs:
+        mapping.setdefault("pose", topics.GROUND_TRUTH_PREFIX + "pose")
+    found = preflight.inspect(source.bag, mapping)
+    leader = found.mapping.roles.get("rgb", found.mapping.roles.get("depth", ""))
+    camera, distortion = (None, None) if request.calibration is None else read_camera(request.calibration)
     bag = inputs.with_given(
-        bag, request.out, image_topic=leader, camera=camera, poses=request.poses, extrinsic=extrinsic
+        source.bag,
+        request.out,
+        image_topic=leader,
+        camera=camera,
+        distortion=distortion,
+        poses=request.poses,
+        extrinsic=_extrinsic(request, found),
+        limit=request.reading.limit,
     )
-    return preflight.inspect(bag, request.mapping)
+    return (found if bag == source.bag else preflight.inspect(bag, mapping)), source
 
 
-def explain(
-    paths: tuple[Path, ...], goal: str, calibration: Path | None, poses: Path | None, user: Mapping[str, str]
-) -> tuple[dict[str, Any], str]:
-    """The line an input would get and why, as values and as text; nothing is computed."""
+def _planned(request: RunRequest, given: BagInput, source: inputs.Resolved) -> Plan:
+    """The line for the user's goal, or without one for the goal that suits the input."""
+    goal = source.goal if request.goal == "auto" else request.goal
+    return plan(given.mapping.available, goal, load_blocks(), request.use)
+
+
+def _extrinsic(request: RunRequest, found: BagInput) -> tuple[str, str, Float64] | None:
+    """The user's (camera frame, lidar frame, T_camera_lidar)."""
+    if request.extrinsic is None:
+        return None
+    if "lidar" not in found.mapping.roles:
+        raise ConfigError(f"--extrinsic {request.extrinsic}: the input has no LiDAR to place")
+    frame = found.frames["rgb" if "rgb" in found.frames else "depth"]
+    return frame, found.frames["lidar"], read_extrinsic(request.extrinsic)
+
+
+def explain(request: RunRequest) -> tuple[dict[str, Any], str]:
+    """The line an input would get and why, as values and as text.
+
+    Nothing is computed, and of a data set only the first frames are read.
+    """
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as scratch:
-        request = RunRequest(paths, goal, out=Path(scratch), calibration=calibration, poses=poses, mapping=user)
-        given = prepare(request)
-    made = plan(given.mapping.available, goal, load_blocks())
-    reasons = [*given.mapping.reasons, *made.explain().splitlines()]
+        reading = replace(request.reading, limit=inputs.PROBE)
+        given, source = prepare(replace(request, out=Path(scratch), reading=reading))
+    made = _planned(request, given, source)
+    reasons = [*source.notes, *given.mapping.reasons, *made.explain().splitlines()]
     return {
         "goal": made.goal,
         "line": list(made.ids),
@@ -115,15 +140,17 @@ def run(request: RunRequest) -> Summary:
     Raises:
         SceneFactoryError: bad input or configuration; nothing already written is lost.
     """
-    given = prepare(request)
-    made = plan(given.mapping.available, request.goal, load_blocks())
+    given, source = prepare(request)
+    for note in source.notes:
+        print(f"sf: {note}", file=sys.stderr)
+    made = _planned(request, given, source)
     made.check_runnable()
     if any(step.sources.get(q) == "input" for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
         preflight.check_extrinsic(given)
     config = ConfigFile.load(request.config, request.overrides)
-    config.check_sections(SECTIONS)
+    config.check_sections({spec.name for spec in load_blocks()} | {"sync", "hosts"})
     folder = RunFolder(request.out)
-    _write_facts(folder, request, given, made, config)
+    _write_facts(folder, request, given, source, made, config)
     started = time.monotonic()
     given, rest = calibrated(given, made, config, request.out)
     dropped = _engine(request.engine)(folder, given, rest, config, request.rate)
@@ -145,10 +172,13 @@ def _engine(name: str) -> Any:
     return run_inproc
 
 
-def _write_facts(folder: RunFolder, request: RunRequest, given: BagInput, made: Plan, config: ConfigFile) -> None:
+def _write_facts(
+    folder: RunFolder, request: RunRequest, given: BagInput, source: inputs.Resolved, made: Plan, config: ConfigFile
+) -> None:
     """``run.json`` and the effective ``config.yaml``, before anything runs: a broken run explains itself too."""
     facts = {
         "input": [str(p) for p in request.inputs],
+        "input_notes": source.notes,
         "bag": str(given.bag.resolve()),
         "engine": request.engine,
         "goal": made.goal,

@@ -1,6 +1,8 @@
 """For colcon only, where this folder is a package of its own; pip uses the pyproject.toml above it."""
 
 # SPDX-License-Identifier: Apache-2.0
+from glob import glob
+
 from setuptools import find_packages, setup
 
 NAME = "sf_bringup"
@@ -15,6 +17,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
+        *((f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*"))) for folder in ("launch", "config", "rviz")),
     ],
     entry_points={
         # sf_recon is an ament_cmake package, which declares no entry points of its own.

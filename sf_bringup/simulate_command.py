@@ -22,6 +22,7 @@ _CHANGES = (
     "lidar_hz",
     "seed",
     "supersampling",
+    "novel_views",
 )
 
 
@@ -39,6 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ("supersampling", int),
     ):
         parser.add_argument(f"--{name}", type=kind)
+    parser.add_argument("--novel-views", type=int, help="images off the path, to measure extrapolation with")
+    parser.add_argument("--mesh", type=Path, help="also write the true surface as .ply, in the bag's map frame")
     for name in ("fps", "focal", "lidar-hz"):
         parser.add_argument(f"--{name}", type=float)
     parser.add_argument("--depth", help="none, exact, structured_light or tof")
@@ -71,7 +74,7 @@ def simulate_command(args: argparse.Namespace) -> int:
         changes["ground_truth_depth"] = False
     args.out.parent.mkdir(parents=True, exist_ok=True)
     with Progress("simulating", "frames") as progress:
-        made = simulate(replace(spec, **changes), args.out, progress.update)
+        made = simulate(replace(spec, **changes), args.out, progress.update, args.mesh)
     value = {
         "out": str(args.out),
         "frames": made.frames,

@@ -9,14 +9,17 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from sf_bringup import measures, report
+from sf_bringup import figures, measures
+from sf_bringup.evaluation.trajectory import AlignedTrajectories, align_trajectories
+from sf_bringup.report import Page, Row, add_figures
 from sf_bringup.run_folder import RunFolder
 from sf_interfaces import topics
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.ros.messages import decode_depth, decode_image, to_ns
-from sf_interfaces.types import DepthMap
+from sf_interfaces.types import DepthMap, Float64
 
 V = TypeVar("V")
 
@@ -28,19 +31,19 @@ class Summary:
     run: RunFolder
     values: dict[str, Any]
 
-    def rows(self) -> list[report.Row]:
+    def rows(self) -> list[Row]:
         """The table, most important line first; what could not be measured says why."""
         v = self.values
-        rows = [report.Row("line", " -> ".join(v["line"])), report.Row("time", _time_text(v))]
+        rows = [Row("line", " -> ".join(v["line"])), Row("time", _time_text(v))]
         for topic, count in v["topics_in"].items():
-            rows.append(report.Row(f"in   {topic}", f"{count['count']} messages, {count['rate']:.1f} Hz"))
+            rows.append(Row(f"in   {topic}", f"{count['count']} messages, {count['rate']:.1f} Hz"))
         for topic, count in v["topics_out"].items():
-            rows.append(report.Row(f"out  {topic}", f"{count['count']} messages"))
+            rows.append(Row(f"out  {topic}", f"{count['count']} messages"))
         dropped = {k: n for k, n in v["dropped"].items() if n}
-        rows.append(report.Row("dropped", json.dumps(dropped) if dropped else "nothing"))
+        rows.append(Row("dropped", json.dumps(dropped) if dropped else "nothing"))
         for name, text in _MEASURE_TEXT.items():
             if name in v:
-                rows.append(report.Row(name, v[name] if isinstance(v[name], str) else text(v[name])))
+                rows.append(Row(name, v[name] if isinstance(v[name], str) else text(v[name])))
         return rows
 
     def text(self) -> str:
@@ -57,7 +60,7 @@ def _time_text(v: Mapping[str, Any]) -> str:
 _MEASURE_TEXT: dict[str, Callable[[dict[str, float]], str]] = {
     "trajectory": lambda m: (
         f"ATE RMSE {100 * m['rmse']:.2f} cm, max {100 * m['max']:.2f} cm over {m['pairs']:.0f} frames, "
-        f"path {m['path_length']:.2f} m"
+        f"RPE {1000 * m['rpe_rmse']:.1f} mm, {m['rpe_rotation_rmse']:.2f} deg per frame, path {m['path_length']:.2f} m"
     ),
     "depth": lambda m: (
         f"absrel {m['absrel']:.2f} %, inliers 1.03 {m['inlier']:.1f} %, RMSE {m['rmse']:.3f} m, "
@@ -69,9 +72,16 @@ _MEASURE_TEXT: dict[str, Callable[[dict[str, float]], str]] = {
     ),
     "render": lambda m: (
         f"held-out views: PSNR {m['psnr_surface']:.2f} dB on the surface ({m['covered']:.0f} % of pixels), "
-        f"{m['psnr_full']:.2f} dB on the whole image, {m['views']:.0f} views"
+        f"{m['psnr_full']:.2f} dB and SSIM {m['ssim']:.3f} on the whole image, {m['views']:.0f} views; "
+        f"off the path: {_novel_text(m['extrapolated'])}"
     ),
 }
+
+
+def _novel_text(scores: dict[str, float] | str) -> str:
+    if isinstance(scores, str):
+        return scores
+    return f"PSNR {scores['psnr_surface']:.2f} dB on the surface, {scores['views']:.0f} views"
 
 
 def _or_reason(measure: Callable[[], V]) -> V | str:
@@ -124,14 +134,14 @@ def summarise(run: RunFolder) -> Summary:
         "trajectory": lambda: measures.measure_trajectory(run).as_dict(),
         "depth": lambda: measures.measure_depth(run).as_dict(),
         "completion": lambda: measures.measure_completion(run, 0.5).as_dict(),
-        "render": lambda: measures.render_scores(measures.render_held_out(run)),
+        "render": lambda: measures.measure_render(run),
     }
     values |= {name: _or_reason(measure) for name, measure in measured.items()}
     (run.path / "summary.json").write_text(json.dumps(values, indent=2, default=str))
     return Summary(run, values)
 
 
-def _last_keyframe_sample(run: RunFolder) -> report.Sample | None:
+def _last_keyframe_sample(run: RunFolder) -> figures.Sample | None:
     """Image, LiDAR points, completed depth and rendered view of the keyframe in the middle of the run."""
     maps = dict(run.depth_maps())
     if not maps:
@@ -150,40 +160,56 @@ def _last_keyframe_sample(run: RunFolder) -> report.Sample | None:
     if topics.KEYFRAME_DEPTH.name in found:
         sparse = decode_depth(found[topics.KEYFRAME_DEPTH.name])
     views = measures.render_held_out(run)
-    middle = views[len(views) // 2][1] if views else None
+    middle = views[len(views) // 2].rendered if views else None
     is_sparse = sparse is not None and sparse.density < 0.5
     image = decode_image(found[topics.KEYFRAME_IMAGE.name])
-    return report.Sample(image, sparse if is_sparse else None, maps[stamp], middle)
+    return figures.Sample(image, sparse if is_sparse else None, maps[stamp], middle)
+
+
+def run_figures(run: RunFolder) -> dict[str, Figure]:
+    """Every plot that this run has the data for, by name."""
+    out = {}
+    sample, pair = _or_reason(lambda: _last_keyframe_sample(run)), _or_reason(lambda: _aligned(run))
+    if isinstance(sample, figures.Sample):
+        out["overview"] = figures.overview(sample)
+    if isinstance(pair, AlignedTrajectories):
+        out["trajectory"] = figures.trajectory_figure(pair)
+    depth = _or_reason(lambda: [(found, truth) for _, found, truth in measures.depth_pairs(run)])
+    if depth and not isinstance(depth, str):
+        shown = sorted({0, len(depth) // 2, len(depth) - 1})
+        out["depth error"] = figures.depth_error_figure([depth[k] for k in shown])
+        errors = _calibration_samples(depth)
+        if errors is not None:
+            out["calibration of the depth variance"] = figures.calibration_figure(*errors)
+    if (times := run.timing()) is not None:
+        out["rate and latency"] = figures.timing_figure({name: t["each_ms"] for name, t in times.items()})
+    return out
+
+
+def _aligned(run: RunFolder) -> AlignedTrajectories:
+    return align_trajectories(run.trajectory(), measures.truth_of(run))
 
 
 def write_page(summary: Summary) -> None:
     """Write ``overview.png`` and ``report.html`` into the run folder."""
-    run = summary.run
-    figures = {}
-    sample = _or_reason(lambda: _last_keyframe_sample(run))
-    trajectory = _or_reason(run.trajectory)
-    if isinstance(sample, report.Sample) and not isinstance(trajectory, str):
-        truth = measures.reference_trajectory(measures.input_bag(run))
-        estimate, reference = report.aligned_positions(trajectory, truth)
-        figure = report.overview(sample, estimate, reference)
-        figure.savefig(run.path / "overview.png", dpi=80)
-        figures["overview"] = figure
-    errors = _calibration_samples(run)
-    if errors is not None:
-        figures["calibration of the depth variance"] = report.calibration_figure(*errors)
-    details = {"line": run.info()["explanation"], "numbers": summary.values}
-    report.write_report(run.path / "report.html", "SceneFactory run", summary.rows(), figures, details)
-    report.close(figures)
+    run, made = summary.run, run_figures(summary.run)
+    if "overview" in made:
+        made["overview"].savefig(run.path / "overview.png", dpi=80)
+    page = Page("SceneFactory run")
+    page.table([(r.name, r.value) for r in summary.rows()])
+    add_figures(page, made)
+    page.details("line", run.info()["explanation"])
+    page.details("numbers", summary.values)
+    page.write(run.path / "report.html")
+    figures.close(made)
 
 
-def _calibration_samples(run: RunFolder) -> tuple[np.ndarray, np.ndarray] | None:
+def _calibration_samples(pairs: list[tuple[DepthMap, DepthMap]]) -> tuple[Float64, Float64] | None:
     """Absolute errors and sigmas of all completed pixels with ground truth, [N] each, m."""
-    maps = {s: d for s, d in run.depth_maps() if d.variance is not None}
     errors, sigmas = [], []
-    truth = measures.decoded(measures.input_bag(run), measures.GROUND_TRUTH_DEPTH, decode_depth, set(maps))
-    for stamp, reference in truth:
-        depth = maps[stamp]
-        both = depth.valid & reference.valid
-        errors.append(np.abs(depth.z[both] - reference.z[both]))
-        sigmas.append(np.sqrt(depth.variance[both]))
+    for depth, reference in pairs:
+        if depth.variance is not None:
+            both = depth.valid & reference.valid
+            errors.append(np.abs(depth.z[both] - reference.z[both]))
+            sigmas.append(np.sqrt(depth.variance[both]))
     return (np.concatenate(errors), np.concatenate(sigmas)) if errors else None

@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,6 +21,7 @@ _ROLE_TOPIC = {
     "lidar": topics.LIDAR_POINTS.name,
     "pose": topics.GIVEN_POSE.name,
 }
+_STREAM = {"rgb": "image", "depth": "depth"}  # role -> stream that may come compressed
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +56,13 @@ def sync_values(plan: Plan, roles: Mapping[str, str], step: Step) -> dict[str, b
 
 
 def launches(
-    plan: Plan, roles: Mapping[str, str], config: ConfigFile, *, lossless: bool, out: str = ""
+    plan: Plan,
+    roles: Mapping[str, str],
+    config: ConfigFile,
+    *,
+    lossless: bool,
+    out: str = "",
+    compressed: Collection[str] = (),
 ) -> tuple[NodeLaunch, ...]:
     """The processes of a plan, in its order.
 
@@ -64,6 +71,7 @@ def launches(
         config: sections that become node parameters.
         lossless: replay without dropping.
         out: folder for the nodes' files, empty for none.
+        compressed: roles whose topic carries CompressedImage.
     """
     plan.check_runnable()
     first = plan.steps[0]
@@ -73,33 +81,47 @@ def launches(
         raise PlanError(
             "single frames without poses are completed in one process: leave --engine ros out, or use --goal recon"
         )
-    return tuple(_launch(plan, step, roles, config, lossless, out) for step in plan.steps)
+    streams = [_STREAM[role] for role in roles if role in compressed]
+    return tuple(_launch(plan, step, roles, config, lossless, out, streams) for step in plan.steps)
 
 
 def _source(step: Step) -> str:
-    """Where a node's frames or keyframes come from: the nearest block upstream, or the sensors."""
-    if step.spec.name == "recon" and step.sources.get(Q.DEPTH, INPUT).startswith("depth"):
+    """Which stream a node takes in: keyframes completed (depth) or tracked, whoever provides them, or the sensors'."""
+    if _provider(step, Q.DEPTH) and Q.DEPTH in step.spec.requires:
         return "depth"
-    if step.spec.name in ("recon", "depth") and step.sources.get(Q.POSE) == "tracking":
-        return "tracking"
-    return "sensors"
+    return "tracking" if _provider(step, Q.POSE) else "sensors"
+
+
+def _provider(step: Step, quantity: Quantity) -> str:
+    """Name of the node upstream that completes a quantity; empty where it is given or not used."""
+    source = step.sources.get(quantity, INPUT)
+    return "" if source == INPUT else source.partition(":")[0]
 
 
 def _launch(
-    plan: Plan, step: Step, roles: Mapping[str, str], config: ConfigFile, lossless: bool, out: str
+    plan: Plan,
+    step: Step,
+    roles: Mapping[str, str],
+    config: ConfigFile,
+    lossless: bool,
+    out: str,
+    compressed: Sequence[str],
 ) -> NodeLaunch:
     source = _source(step)
-    flexion = step.spec.name != "flexion" and source == "sensors" and step.sources.get(Q.IMAGE) == "flexion"
+    made_image = _provider(step, Q.IMAGE) if source == "sensors" else ""
     parameters: dict[str, Any] = {"source": source, "lossless": lossless, "out": out}
     remaps: dict[str, str] = {}
-    if flexion:
-        parameters["upstream"] = "flexion"
+    upstream = made_image or _provider(step, Q.DEPTH if source == "depth" else Q.POSE)
+    if upstream and upstream != source:
+        parameters["upstream"] = upstream
+    if made_image:
         remaps[topics.RGB_IMAGE.name] = topics.FLEXION_IMAGE.name
     if step.spec.mode:
         parameters["mode"] = step.spec.mode
     parameters |= dict(config.sections.get(step.spec.name, {}))
     if source == "sensors":
-        sync = {**sync_values(plan, roles, step), **config.sections.get("sync", {})}
+        carried = [stream for stream in compressed if not (made_image and stream == "image")]
+        sync = {**sync_values(plan, roles, step), "compressed": carried, **config.sections.get("sync", {})}
         parameters |= {f"sync.{key}": value for key, value in sync.items()}
         remaps |= {
             own: roles[role]

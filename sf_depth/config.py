@@ -13,21 +13,23 @@ class DepthConfig:
     """How sparse depth becomes dense depth with variance (paper Sec. ScaleCov)."""
 
     mode: str = option("complete", "what the node does: complete, slam or posed")
-    neighbours: int = option(16, "observations each tile of pixels is conditioned on", low=4, high=128)
-    tile: int = option(8, "side in px of the tiles that share their observations", low=1, high=32)
-    length_scale: float = option(
-        0.0, "correlation length in mean point spacings; 0 = most likely one per image", low=0.0, high=64.0
-    )
+    # completion (ScaleCov)
+    neighbours: int = option(16, "observations each tile of pixels is conditioned on", low=4, high=64)
+    tile: int = option(4, "side in px of the tiles that share their observations", low=1, high=32)
+    length_scale: float = option(2.0, "correlation length in point spacings", low=0.1, high=64.0)
     color_scale: float = option(
+        0.1, "colour difference (0..1) at which an observation counts half", low=0.01, high=10.0
+    )
+    covariance_color_scale: float = option(
         0.08, "colour difference (0..1) over which correlation falls to 0.6", low=0.01, high=10.0
     )
     edge_strength: float = option(
         1.0, "how much correlation shortens across image edges; 0 = not at all", low=0.0, high=100.0
     )
-    nugget: float = option(0.01, "noise variance of an observation relative to the prior", low=1e-5, high=1.0)
+    nugget: float = option(0.1, "noise variance of an observation relative to the prior", low=1e-5, high=10.0)
     depth_sigma: float = option(0.03, "noise of a measured depth, m (1 sigma)", low=1e-5, high=10.0)
     max_sigma: float = option(0.0, "pixels less certain than this, m, become NaN; 0 = keep all", low=0.0)
-    seed: int = option(0, "seed of the subset the length scale is estimated on", low=0)
+    seed: int = option(0, "seed of the observations that calibrate the variance", low=0)
     # multi-view depth (paper Sec. Depth Recovery with Dense Correlation, Depth Frame Selection)
     matcher: str = option("flow", "dense matcher: flow, or one of an installed package")
     intrinsics: str = option("f", "what is estimated of an unknown camera: f, pinhole or radial")

@@ -82,6 +82,7 @@ class DepthNode(BlockNode):
             if self.wanted(topics.DENSE_POINTS):
                 self.output(topics.DENSE_POINTS).publish(messages.encode_cloud(messages.rclpy_factory, _points(dense)))
             self.sent_one(dense.stamp_ns)
+            self._source.done(dense.stamp_ns)
 
 
 def _points(keyframe: Keyframe) -> PointCloud:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any, ClassVar
 
 from sf_flexion.config import FlexionConfig
-from sf_flexion.core.flexion import flexion_image
+from sf_flexion.core.flexion import Flexion
 from sf_interfaces import topics
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.node import BlockNode
@@ -24,7 +24,7 @@ class FlexionNode(BlockNode):
 
     def setup(self) -> None:
         """Depth leads; every depth image gives one image."""
-        self._config = self.config()
+        self._flexion = Flexion(self.config())
         sync = replace(self.sync_config(), image=False, depth=True, lidar=False, pose=False)
         self._inputs = SensorInputs(sync, lossless=self.options.lossless)
         self.leader = self._inputs.leader
@@ -46,11 +46,12 @@ class FlexionNode(BlockNode):
         """Why depth images were dropped."""
         self.health.set_drops(dict(self._inputs.assembler.reasons) if self.leader else {})
         self.health.waiting(self._inputs.assembler.waiting_for if self.leader else "")
+        self.health.value("step", self._flexion.step if self.leader else None)
 
     def _convert(self) -> None:
         for frame in self._inputs.assembler.ready():
             assert frame.depth is not None and frame.camera is not None
-            image = flexion_image(frame.depth, frame.camera, self._config)
+            image = self._flexion(frame.depth, frame.camera)
             sent = messages.encode_image(messages.rclpy_factory, image, frame.stamp_ns, frame.camera.frame_id)
             self.output(topics.FLEXION_IMAGE).publish(sent)
             self.sent_one(frame.stamp_ns)

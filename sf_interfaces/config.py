@@ -25,10 +25,20 @@ def option(default: Any, help: str, *, low: float | None = None, high: float | N
     return field(default=default, metadata={"help": help, "low": low, "high": high})
 
 
+def _parse(text: str, where: str) -> Any:
+    """A value in YAML, without running anything it might ask for."""
+    try:
+        return yaml.safe_load(text)
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise ConfigError(
+            f"{where}: cannot read '{text}' ({' '.join(str(error).split())}); write it as YAML"
+        ) from error
+
+
 def _typed(key: str, value: Any, default: Any) -> Any:
     """``value`` in the type of ``default``. A YAML string is parsed first, an int may stand for a float."""
     if isinstance(value, str) and not isinstance(default, str):
-        value = yaml.safe_load(value)
+        value = _parse(value, f"config key '{key}'")
     if isinstance(default, bool) and isinstance(value, bool):
         return value
     if isinstance(default, float) and isinstance(value, (int, float)) and not isinstance(value, bool):
@@ -83,7 +93,7 @@ class ConfigFile:
         if path is not None:
             try:
                 loaded = yaml.safe_load(path.read_text()) or {}
-            except (OSError, yaml.YAMLError) as error:
+            except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
                 raise ConfigError(f"cannot read config {path}: {error}; give a YAML file") from error
             if not isinstance(loaded, dict) or not all(isinstance(v, dict) for v in loaded.values()):
                 raise ConfigError(f"{path} must hold sections of keys, such as 'tracking: {{patches: 128}}'")
@@ -92,7 +102,7 @@ class ConfigFile:
             section, _, key = dotted.partition(".")
             if not key:
                 raise ConfigError(f"--set {dotted}={value}: write it as section.key=value")
-            sections.setdefault(section, {})[key] = yaml.safe_load(value)
+            sections.setdefault(section, {})[key] = _parse(value, f"--set {dotted}")
         return ConfigFile(sections)
 
     def build(self, section: str, cls: type[C]) -> C:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from sf_interfaces.calibrations import Calibration, Calibrations
 from sf_interfaces.config import option
 from sf_interfaces.errors import CalibrationError, SceneFactoryError
 from sf_interfaces.geometry import se3
@@ -42,6 +43,7 @@ class SyncConfig:
     reset_s: float = option(1.0, "a backward jump in time beyond this starts anew, s", low=0.0)
     depth_registered: bool = option(False, "take depth as registered to the image though its frame differs")
     pose_frame: str = option("", "frame whose pose is given, such as base_link (empty: the optical frame)")
+    compressed: tuple[str, ...] = option((), "streams that arrive as CompressedImage: image, depth")
     extrinsic: tuple[float, ...] = option((), "T_camera_lidar as x y z qx qy qz qw (empty: from /tf_static)")
 
     @property
@@ -60,6 +62,7 @@ class FrameAssembler:
     Attributes:
         reasons: why messages were dropped or left unmatched, with counts.
         epoch: grows by one whenever the leading stream's time jumped back; valid for the frame last taken.
+            A changed calibration begins no epoch: frames carry their camera, and its change shows there.
     """
 
     def __init__(self, config: SyncConfig = SyncConfig()) -> None:
@@ -69,7 +72,8 @@ class FrameAssembler:
         self.reasons: dict[str, int] = {}
         self.epoch = 0
         self.transforms = FrameTree()
-        self._cameras: dict[str, tuple[Camera, Distortion | None]] = {}
+        self._cameras: dict[str, Calibrations] = {}
+        self._calibration: dict[str, Calibration] = {}  # of the frame last taken
         self._pending: deque[StreamItem] = deque()
         wanted = {"image": config.image, "depth": config.depth, "lidar": config.lidar, "pose": config.pose}
         wanted[config.leader] = True
@@ -109,16 +113,18 @@ class FrameAssembler:
         """
         self._push("pose", stamp_ns, check_pose(T, "given pose"), "")
 
-    def push_camera(self, camera: Camera, distortion: Distortion | None = None) -> None:
-        """The calibration of ``camera.frame_id``. The first one holds; a different one is refused.
+    def push_camera(self, camera: Camera, distortion: Distortion | None = None, stamp_ns: int = 0) -> None:
+        """The calibration of ``camera.frame_id`` from ``stamp_ns`` on; images before the first use the first.
 
         Args:
             camera: intrinsics; they stay those of the undistorted image.
             distortion: the lens distortion still in the images, taken out when a frame is assembled.
         """
-        known = self._cameras.setdefault(camera.frame_id, (camera, distortion))
-        if known != (camera, distortion):
-            self._count("camera_info changed within the stream: the first calibration is kept")
+        known = self._cameras.setdefault(camera.frame_id, Calibrations())
+        ignored = known.ignored
+        known.add(stamp_ns, (camera, distortion))
+        if known.ignored > ignored:
+            self._count("camera_info changed too little to matter, or not in time: the one in use is kept")
 
     def push_transform(self, parent: str, child: str, T: Float64, stamp_ns: int = 0, *, static: bool = True) -> None:
         """One link ``T_parent_child`` of /tf_static (or /tf: used for publishing, never for extrinsics)."""
@@ -164,6 +170,8 @@ class FrameAssembler:
         late = [name for name, s in self._streams.items() if not s.passed(item.key)]
         if item.frame_id not in self._cameras:
             return self._no_camera(item.frame_id)
+        if not self._cameras[item.frame_id].settled(item.key.stamp_ns, self._leading_ns):
+            late.append("camera_info")
         if self._lacks_extrinsic(item.frame_id) and self._sweeps_without_extrinsic >= 3:
             return self._no_extrinsic(item.frame_id)
         return f"waiting for {' and '.join(late)} up to the stamp of the image" if late else ""
@@ -194,6 +202,7 @@ class FrameAssembler:
             return True
         complete = (
             item.frame_id in self._cameras
+            and self._cameras[item.frame_id].settled(item.key.stamp_ns, self._leading_ns)
             and not self._lacks_extrinsic(item.frame_id)
             and all(stream.passed(item.key) for stream in self._streams.values())
         )
@@ -206,7 +215,7 @@ class FrameAssembler:
     def _assemble(self, item: StreamItem) -> Frame | None:
         if item.frame_id not in self._cameras:
             raise CalibrationError(self._no_camera(item.frame_id))
-        camera, distortion = self._cameras[item.frame_id]
+        camera, distortion = self._calibrated(item)
         T, twist = self._pose(item, camera.frame_id) if self.config.pose else (None, self._twist())
         if self.config.pose and T is None:
             return None
@@ -216,6 +225,19 @@ class FrameAssembler:
         image = undistort_image(item.value, camera, distortion) if self.config.image else None
         sparse = self._sparse(item, camera, twist) if self.config.lidar else None
         return Frame(item.key.stamp_ns, camera, image, depth, sparse, T)
+
+    @property
+    def _leading_ns(self) -> int:
+        newest = self._streams[self.config.leader].newest
+        return 0 if newest is None else newest.stamp_ns
+
+    def _calibrated(self, item: StreamItem) -> Calibration:
+        """The calibration valid at the image; a change is said."""
+        found = self._cameras[item.frame_id].at(item.key.stamp_ns)
+        if self._calibration.setdefault(item.frame_id, found) != found:
+            self._count(f"camera_info of '{item.frame_id}' changed: frames use the new calibration from here on")
+            self._calibration[item.frame_id] = found
+        return found
 
     def _depth(self, item: StreamItem) -> DepthMap | None:
         if not self.config.image:
@@ -277,13 +299,13 @@ class FrameAssembler:
             return before.value @ T_child_camera, None
         T0, T1 = before.value @ T_child_camera, after.value @ T_child_camera
         alpha = (item.key.stamp_ns - t0) / (t1 - t0)
-        return se3.interpolate(T0, T1, alpha), _twist_between(t0, T0, t1, T1)
+        return se3.interpolate(T0, T1, alpha), se3.twist_between(t0, T0, t1, T1)
 
     def _twist(self) -> Float64 | None:
         if len(self._poses) < 2:
             return None
         (t0, T0), (t1, T1) = self._poses
-        return _twist_between(t0, T0, t1, T1)
+        return se3.twist_between(t0, T0, t1, T1)
 
     def _extrinsic(self, camera_frame: str, lidar_frame: str) -> Float64 | None:
         """``T_camera_lidar``: given, or from the static tree; the first that is found holds."""
@@ -322,8 +344,3 @@ class FrameAssembler:
             if unused and name in ("depth", "lidar"):
                 reason = f"{name} message matched no image"
                 self.reasons[reason] = self.reasons.get(reason, 0) + unused
-
-
-def _twist_between(t0_ns: int, T0: Float64, t1_ns: int, T1: Float64) -> Float64:
-    """Constant twist [6] (m/s, rad/s) in the moving frame that carries T0 into T1."""
-    return se3.log(se3.inverse(T0) @ T1) / ((t1_ns - t0_ns) / _S)

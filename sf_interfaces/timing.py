@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from time import perf_counter
+from typing import Any
 
 
 @dataclass(slots=True)
 class Timings:
     """Seconds and calls per stage. Stages may nest; each counts its own full duration."""
 
-    seconds: dict[str, float] = field(default_factory=dict)
-    calls: dict[str, int] = field(default_factory=dict)
+    each: dict[str, list[float]] = field(default_factory=dict)  # seconds of every call
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
@@ -23,21 +23,21 @@ class Timings:
         try:
             yield
         finally:
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + perf_counter() - start
-            self.calls[stage] = self.calls.get(stage, 0) + 1
+            self.each.setdefault(stage, []).append(perf_counter() - start)
 
-    def mean_ms(self, stage: str) -> float:
-        """Mean duration of one call, ms (0 where the stage never ran)."""
-        calls = self.calls.get(stage, 0)
-        return 1e3 * self.seconds[stage] / calls if calls else 0.0
+    def median_ms(self, stage: str) -> float:
+        """Median duration of one call, ms (0 where the stage never ran)."""
+        calls = sorted(self.each.get(stage, []))
+        return 1e3 * calls[len(calls) // 2] if calls else 0.0
 
-    def to_dict(self) -> dict[str, dict[str, float]]:
-        """Ready for timing.json: stage -> seconds, calls, mean_ms."""
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """Ready for timing.json: stage -> seconds, calls, median_ms and each_ms of every call."""
         return {
             stage: {
-                "seconds": self.seconds[stage],
-                "calls": self.calls[stage],
-                "mean_ms": self.mean_ms(stage),
+                "seconds": sum(each),
+                "calls": len(each),
+                "median_ms": self.median_ms(stage),
+                "each_ms": [round(1e3 * s, 3) for s in each],
             }
-            for stage in self.seconds
+            for stage, each in self.each.items()
         }

@@ -11,7 +11,8 @@ class Qos(Enum):
     """The kinds of connection; ``ros/qos.py`` turns them into QoS profiles."""
 
     SENSOR = "sensor"  # best effort, keep 5: works with reliable and best-effort publishers alike
-    RELIABLE = "reliable"  # reliable, keep 100: keyframes and results
+    RELIABLE = "reliable"  # reliable, keep 100: results
+    KEYFRAME = "keyframe"  # live: reliable, the last 30 kept for a node that starts (again); replay: as RELIABLE
     LATEST = "latest"  # reliable, keep 1
     LATCHED = "latched"  # reliable, transient local, keep 1
     MAP = "map"  # reliable, transient local, keep 100
@@ -44,16 +45,16 @@ FLEXION_IMAGE = Topic("/sf/flexion/image", _IMAGE, Qos.RELIABLE, "optical")
 
 TRACKING_POSE = Topic("/sf/tracking/pose", _POSE, Qos.RELIABLE, "map")
 TRACKING_PATH = Topic("/sf/tracking/path", "nav_msgs/msg/Path", Qos.LATCHED, "map")
-KEYFRAME_IMAGE = Topic("/sf/tracking/keyframe/image", _IMAGE, Qos.RELIABLE, "optical")
-KEYFRAME_INFO = Topic("/sf/tracking/keyframe/camera_info", _INFO, Qos.RELIABLE, "optical")
-KEYFRAME_POSE = Topic("/sf/tracking/keyframe/pose", _POSE, Qos.RELIABLE, "map")
-KEYFRAME_DEPTH = Topic("/sf/tracking/keyframe/depth", _IMAGE, Qos.RELIABLE, "optical")
-KEYFRAME_LANDMARKS = Topic("/sf/tracking/keyframe/landmarks", _CLOUD, Qos.RELIABLE, "optical")
+KEYFRAME_IMAGE = Topic("/sf/tracking/keyframe/image", _IMAGE, Qos.KEYFRAME, "optical")
+KEYFRAME_INFO = Topic("/sf/tracking/keyframe/camera_info", _INFO, Qos.KEYFRAME, "optical")
+KEYFRAME_POSE = Topic("/sf/tracking/keyframe/pose", _POSE, Qos.KEYFRAME, "map")
+KEYFRAME_DEPTH = Topic("/sf/tracking/keyframe/depth", _IMAGE, Qos.KEYFRAME, "optical")
+KEYFRAME_LANDMARKS = Topic("/sf/tracking/keyframe/landmarks", _CLOUD, Qos.KEYFRAME, "optical")
 
-DENSE_IMAGE = Topic("/sf/depth/dense/image", _IMAGE, Qos.RELIABLE, "optical")
-DENSE_VARIANCE = Topic("/sf/depth/dense/variance", _IMAGE, Qos.RELIABLE, "optical")
-DENSE_INFO = Topic("/sf/depth/dense/camera_info", _INFO, Qos.RELIABLE, "optical")
-DENSE_POSE = Topic("/sf/depth/dense/pose", _POSE, Qos.RELIABLE, "map")
+DENSE_IMAGE = Topic("/sf/depth/dense/image", _IMAGE, Qos.KEYFRAME, "optical")
+DENSE_VARIANCE = Topic("/sf/depth/dense/variance", _IMAGE, Qos.KEYFRAME, "optical")
+DENSE_INFO = Topic("/sf/depth/dense/camera_info", _INFO, Qos.KEYFRAME, "optical")
+DENSE_POSE = Topic("/sf/depth/dense/pose", _POSE, Qos.KEYFRAME, "map")
 DENSE_POINTS = Topic("/sf/depth/dense/points", _CLOUD, Qos.RELIABLE, "optical")
 
 SURFACE = Topic("/sf/recon/surface", _CLOUD, Qos.MAP, "map")

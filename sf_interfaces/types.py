@@ -260,7 +260,8 @@ class Keyframe:
     """A frame whose pose is final: it has left the tracker's optimisation window (Sec. III-E).
 
     ``depth`` is sparse (LiDAR pixels), dense, or None until the depth block has completed it;
-    ``landmarks`` are the tracker's patch centres in the optical frame.
+    ``landmarks`` are the tracker's patch centres in the optical frame. ``scale`` is that of the pose and the
+    landmarks.
     """
 
     stamp_ns: int
@@ -269,6 +270,7 @@ class Keyframe:
     T_map_camera: Float64
     depth: DepthMap | None = None
     landmarks: PointCloud | None = None
+    scale: Scale = Scale.METRIC
 
     def __post_init__(self) -> None:
         _set(self, "image", _check_image(self.image, self.camera))

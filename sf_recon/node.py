@@ -1,9 +1,15 @@
-"""The reconstruction node: keyframes with depth in; the surface, rendered views and the map out."""
+"""The reconstruction node: keyframes with depth in; the surface, rendered views and the map out.
+
+Lossless, the worker does everything in the order of the input, like the line in one process. Live, the worker
+places keyframes, a second thread learns and a third one draws (Sec. III-D); a fair lock passes the map between them.
+"""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,14 +18,19 @@ from rclpy.task import Future
 
 from sf_interfaces import topics
 from sf_interfaces.errors import SceneFactoryError
-from sf_interfaces.io.cloud import write_surface
+from sf_interfaces.io.atomic import replace_file
+from sf_interfaces.io.paths import inside
 from sf_interfaces.ros import messages
+from sf_interfaces.ros.inbox import Inbox
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.process import run
 from sf_interfaces.types import Camera, Keyframe, PointCloud
 from sf_recon.config import ReconConfig
+from sf_recon.core.learner import FairLock, Learner
 from sf_recon.core.reconstruction import Reconstruction
+
+_SNAPSHOT_KEYFRAMES = 15  # upstream keeps twice as many for a restarted node
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,21 +59,36 @@ class ReconNode(BlockNode):
     def setup(self) -> None:
         """The reconstruction and its keyframes."""
         self.leader = ""
-        self._reconstruction = Reconstruction(self.config())
+        saved = self.snapshot("recon.sfmap")
+        self._reconstruction = Reconstruction(self.config()) if saved is None else Reconstruction.load(saved)
         self._source = KeyframeSource(self, landmarks=False)
+        self._unsaved, self._resumed = 0, saved is not None
         self._camera: Camera | None = None
         self._last_ns = 0
+        self._lock = FairLock()
+        self._learner: Learner | None = None
+        self._drawer: threading.Thread | None = None
+        if not self.options.lossless:
+            self._learner = Learner(self._reconstruction, self._lock)
+            self._jobs = Inbox(lambda kind, job, reason: self.health.drop(reason))
+            self._drawer = threading.Thread(target=self._draw, name="drawer", daemon=True)
+            self._drawer.start()
+        if self.config().view_port:
+            page = self._reconstruction.serve("127.0.0.1", self.config().view_port, self._lock)
+            self.get_logger().info(f"the map is shown at {page.url}")
         self.listen(topics.VIEW_POSE, "view", 1)
         for topic in (topics.SURFACE, topics.VIEW_IMAGE, topics.VIEW_DEPTH):
             self.output(topic)
+        if self._resumed:
+            self._publish_surface(self._reconstruction.surface())
 
     def take(self, kind: str, msg: Any) -> None:
         """Add keyframes; render and save between them."""
         match kind:
-            case "view":
-                self._view(msg)
-            case "render":
-                self._answer(msg, self._render_service)
+            case "view" | "render" if self._drawer is not None:
+                self._jobs.put(kind, msg, 1 if kind == "view" else None)
+            case "view" | "render":
+                self._draw_one(kind, msg)
             case "save":
                 self._answer(msg, self._save_service)
             case _:
@@ -73,11 +99,23 @@ class ReconNode(BlockNode):
         """Final training, the whole surface, and the files."""
         for keyframe in self._source.end():
             self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
-        if self._camera is None:
+        if self._drawer is not None:
+            self._jobs.end()
+            self._drawer.join()
+            self._drawer = None
+        if self._learner is not None:
+            self._learner.stop()
+            if self.out is not None:
+                self._learner.write_timing(self.out / "timing.json")
+        if self._camera is None and not self._resumed:
             self.health.error("nothing was reconstructed: no keyframe with depth arrived")
             return
-        self._reconstruction.finish()
-        self._publish_surface(self._reconstruction.surface())
+        if self.out is not None and not self.options.lossless:
+            self._save(self.out)  # whoever stops a live line may not wait for the last training
+        with self._lock:
+            self._reconstruction.finish()
+            surface = self._reconstruction.surface()
+        self._publish_surface(surface)
         if self.out is not None:
             self._save(self.out)
 
@@ -91,23 +129,51 @@ class ReconNode(BlockNode):
         if keyframe.depth is None:
             self.health.drop("keyframe without any depth")
             return
-        added = self._reconstruction.add(keyframe)
+        if self._learner is None:
+            with self._lock:
+                added = self._reconstruction.add(keyframe)
+        else:
+            came = time.monotonic()
+            with self._lock:
+                placed = self._reconstruction.place(keyframe)
+                added = self._reconstruction.colored(placed, keyframe.stamp_ns)
+            self._learner.arrived(keyframe.stamp_ns, came)
         self._camera, self._last_ns = keyframe.camera, keyframe.stamp_ns
         self.health.count("keyframes")
         self.health.count("points", len(added))
         self._publish_surface(added)
         self.sent_one(keyframe.stamp_ns)
+        self._unsaved += 1
+        if self._unsaved >= _SNAPSHOT_KEYFRAMES and (path := self.state("recon.sfmap")) is not None:
+            with self._lock, replace_file(path) as draft:
+                self._reconstruction.save(draft)
+            self._source.done(keyframe.stamp_ns)
+            self._unsaved = 0
 
     def _publish_surface(self, cloud: PointCloud) -> None:
         placed = PointCloud(cloud.points, cloud.colors, stamp_ns=self._last_ns, frame_id="map")
         self.output(topics.SURFACE).publish(messages.encode_cloud(messages.rclpy_factory, placed))
 
     def _save(self, folder: Path) -> list[Path]:
-        surface = self._reconstruction.surface()
-        paths = [folder / "map.sfmap", folder / "surface.ply"]
-        self._reconstruction.save(paths[0])
-        write_surface(paths[1], surface)
-        return paths
+        with self._lock:
+            return self._reconstruction.save_products(folder)
+
+    # ---- drawing: in a thread of its own when live
+
+    def _draw(self) -> None:
+        while True:
+            job = self._jobs.get()
+            if job is None:
+                continue
+            if job[0] == Inbox.END:
+                return
+            self.guarded(lambda job=job: self._draw_one(*job))  # type: ignore[misc]
+
+    def _draw_one(self, kind: str, msg: Any) -> None:
+        if kind == "view":
+            self._view(msg)
+        else:
+            self._answer(msg, self._render_service)
 
     def _view(self, msg: Any) -> None:
         wanted = [topic for topic in (topics.VIEW_IMAGE, topics.VIEW_DEPTH) if self.wanted(topic)]
@@ -120,7 +186,8 @@ class ReconNode(BlockNode):
 
     def _render(self, camera: Camera, pose: Any) -> tuple[Any, Any]:
         stamp_ns, _, T_map_camera = messages.decode_pose(pose)
-        view = self._reconstruction.render(camera, T_map_camera)
+        with self._lock:
+            view = self._reconstruction.render(camera, T_map_camera)
         image = messages.encode_image(messages.rclpy_factory, view.image, stamp_ns, camera.frame_id)
         return image, messages.encode_depth(messages.rclpy_factory, view.depth, stamp_ns, camera.frame_id)
 
@@ -151,16 +218,16 @@ class ReconNode(BlockNode):
             response.image, response.depth = self._render(camera, request.pose)
 
     def _save_service(self, request: Any, response: Any) -> None:
-        if self._camera is None:
+        if self._camera is None and not self._resumed:
             response.message = "nothing is reconstructed yet; call again after the first keyframe"
             return
         try:
-            folder = Path(request.directory)
+            folder = inside(self.out, request.directory)
             folder.mkdir(parents=True, exist_ok=True)
             response.paths = [str(path) for path in self._save(folder)]
             response.success = True
         except (OSError, SceneFactoryError) as error:
-            response.message = f"cannot save to {request.directory}: {error}"
+            response.message = f"cannot save to '{request.directory}': {error}"
 
 
 def main() -> int:

@@ -9,7 +9,7 @@ from sf_interfaces.blocks import BlockSpec, Quantity
 from sf_interfaces.config import ConfigFile
 
 if TYPE_CHECKING:
-    from sf_tracking.core.tracker import Tracker
+    from sf_tracking.core.session import TrackingSession
 
 SPEC = BlockSpec(
     name="tracking",
@@ -21,9 +21,9 @@ SPEC = BlockSpec(
 )
 
 
-def make(config: ConfigFile) -> Tracker:
+def make(config: ConfigFile) -> TrackingSession:
     """The tracker, configured by section ``tracking``."""
     from sf_tracking.config import TrackingConfig
-    from sf_tracking.core.tracker import Tracker
+    from sf_tracking.core.session import TrackingSession
 
-    return Tracker(config.build("tracking", TrackingConfig))
+    return TrackingSession(config.build("tracking", TrackingConfig))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from time import monotonic
 from typing import Any, ClassVar
 
 from sf_interfaces import topics
@@ -16,7 +17,8 @@ from sf_interfaces.ros.process import run
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.types import Float64, Frame, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.tracker import Tracker, TrackingUpdate
+from sf_tracking.core.session import TrackingSession
+from sf_tracking.core.tracker import TrackingUpdate
 
 _PATH_EVERY_NS = 1_000_000_000
 
@@ -40,12 +42,13 @@ class TrackingNode(BlockNode):
             self.listen(topic, kind, keep)
         for topic in (topics.TRACKING_POSE, topics.TRACKING_PATH, topics.TF, *TRACKED.values()):
             self.output(topic)
+        self._next_save = 0.0
         self._begin()
+        if (snapshot := self.snapshot("tracking.npz")) is not None:
+            self._tracker = TrackingSession.restore(self._config, snapshot)
 
     def _begin(self) -> None:
-        self._tracker = Tracker(self._config)
-        self._keyframes: list[tuple[int, Float64]] = []
-        self._scale = Scale.METRIC
+        self._tracker = TrackingSession(self._config)
         self._path_stamp_ns: int | None = None
         self._epoch = self._inputs.assembler.epoch
 
@@ -62,7 +65,7 @@ class TrackingNode(BlockNode):
         trajectory = self._tracker.trajectory()
         if self.out is not None:
             write_tum(self.out / "trajectory.tum", trajectory)
-            write_tum(self.out / "keyframes.tum", Trajectory.from_pairs(self._keyframes, trajectory.scale))
+            write_tum(self.out / "keyframes.tum", self._tracker.keyframe_trajectory())
         self._publish_path(trajectory)
 
     def refresh(self) -> None:
@@ -98,10 +101,19 @@ class TrackingNode(BlockNode):
 
     def _send_keyframes(self, update: TrackingUpdate) -> None:
         for keyframe in update.keyframes:
-            self._keyframes.append((keyframe.stamp_ns, keyframe.T_map_camera))
             publish_bundle(self, keyframe, TRACKED, set(TRACKED))
             self.health.count("keyframes")
             self.sent_one(keyframe.stamp_ns)
+        if update.keyframes:
+            self._save_state()
+
+    def _save_state(self) -> None:
+        """A snapshot for a successor; a long trajectory is written less often, so that it never costs much."""
+        path, begin = self.state("tracking.npz"), monotonic()
+        if path is None or begin < self._next_save:
+            return
+        self._tracker.save(path)
+        self._next_save = begin + max(1.0, 20 * (monotonic() - begin))
 
     def _publish_path(self, trajectory: Trajectory) -> None:
         if len(trajectory):

@@ -21,7 +21,7 @@ from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.trajectory import read_tum
 
 pytestmark = pytest.mark.graph
-FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.keyframe_pixels=16384"]
+FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.pixels=1024"]
 _domains = iter(range(40, 90))
 
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import open3d as o3d
 
 from sf_bringup.simulate.render import Renderer
 from sf_bringup.simulate.scenes import SCENES
 from sf_bringup.simulate.sensors import LIDARS, SWEEP_PHASE, lidar_sweep, structured_light, time_of_flight
 from sf_bringup.simulate.spec import SimulationSpec
 from sf_bringup.simulate.trajectories import CameraPath, oval
-from sf_interfaces.errors import ConfigError
+from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.types import DepthMap, Float32, Float64, PointCloud
@@ -65,6 +66,16 @@ class Simulator:
             image = np.clip(image + noise + 0.5, 0, 255).astype(np.uint8)
         return image, z, T
 
+    def novel_pose(self, index: int) -> Float64:
+        """T_map_camera of a view off the path: up to half the free distance away, turned by up to 20 degrees."""
+        T = self.path.pose(index / self.spec.fps)
+        rng = np.random.default_rng([self.spec.seed, 4, index])
+        reach = 0.5 * float(self.renderer.clearance(T[None, :3, 3])[0])
+        direction = rng.standard_normal(3)
+        offset = reach * rng.uniform(0.5, 1.0) * direction / np.linalg.norm(direction)
+        turn = np.radians(rng.uniform(-20, 20, 3)) * (0.5, 1.0, 0.25)  # pitch, yaw, roll
+        return T @ se3.exp(np.concatenate([offset, turn]))
+
     def sensor_depth(self, index: int, z: Float32) -> Float32:
         """The depth sensor's reading of exact depth ``z``."""
         rng = np.random.default_rng([self.spec.seed, 2, index])
@@ -91,11 +102,23 @@ class Simulator:
         return PointCloud(cloud.points, None, cloud.time_offset_ns, stamp, LIDAR), intensity
 
 
-def simulate(spec: SimulationSpec, out: Path, progress: Callable[[int, int], None] | None = None) -> SimulationSummary:
-    """Write the recording of ``spec`` to the bag ``out``; ``progress`` gets (frames done, frames)."""
+def simulate(
+    spec: SimulationSpec,
+    out: Path,
+    progress: Callable[[int, int], None] | None = None,
+    mesh: Path | None = None,
+) -> SimulationSummary:
+    """Write the recording of ``spec`` to the bag ``out``; ``progress`` gets (frames done, frames).
+
+    Args:
+        mesh: also write the true surface there, see :func:`write_mesh`.
+    """
     begun = time.perf_counter()
     simulator = Simulator(spec)
+    if mesh is not None:
+        write_mesh(simulator, mesh)
     sweeps = 0
+    novel = set(np.linspace(0, spec.frames - 1, spec.novel_views + 2).astype(int)[1:-1].tolist())
     with SequenceWriter(out) as writer:
         first = START_NS - round(1e9 / spec.lidar_hz)
         writer.tf_static("base_link", "camera_link", T_BASE_CAMERA_LINK, first)
@@ -108,9 +131,36 @@ def simulate(spec: SimulationSpec, out: Path, progress: Callable[[int, int], Non
                 writer.cloud("/lidar/points", *simulator.sweep(sweeps))
                 sweeps += 1
             _write_frame(writer, simulator, k)
+            if k in novel:
+                _write_novel(writer, simulator, k)
             if progress is not None:
                 progress(k + 1, spec.frames)
     return SimulationSummary(out, spec.frames, sweeps, spec.frames / spec.fps, time.perf_counter() - begun)
+
+
+def write_mesh(simulator: Simulator, path: Path) -> int:
+    """Write the scene's triangles as PLY, in the map frame of the recording; returns how many.
+
+    Raises:
+        FormatError: the file cannot be written.
+    """
+    corners = simulator.renderer.scene.corners.reshape(-1, 3).astype(np.float64)
+    mesh = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(corners), o3d.utility.Vector3iVector(np.arange(len(corners)).reshape(-1, 3))
+    )
+    mesh.remove_duplicated_vertices()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not o3d.io.write_triangle_mesh(str(path), mesh):
+        raise FormatError(f"cannot write {path}; give the name of a .ply file in a folder that can be written")
+    return len(mesh.triangles)
+
+
+def _write_novel(writer: SequenceWriter, simulator: Simulator, index: int) -> None:
+    stamp = START_NS + round(index / simulator.spec.fps * 1e9)
+    T = simulator.novel_pose(index)
+    image, _ = simulator.renderer.render(simulator.spec.camera, T, simulator.spec.supersampling)
+    writer.image("/ground_truth/novel/image", stamp, image, OPTICAL)
+    writer.pose("/ground_truth/novel/pose", stamp, T, "map")
 
 
 def _write_frame(writer: SequenceWriter, simulator: Simulator, index: int) -> None:

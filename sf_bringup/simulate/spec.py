@@ -23,7 +23,7 @@ class SimulationSpec:
         frames, fps: length and rate of the camera; width, height, focal: px; path: None = the scene's.
         rgb, depth, lidar: the sensors; lidar_hz: sweeps per second; lidar_fov_deg: horizontal field.
         image_noise: deviation in grey levels; supersampling: n x n rays on edges;
-        ground_truth_depth: also write it.
+        ground_truth_depth: also write it; novel_views: images off the path to write under /ground_truth/novel.
     """
 
     scene: str
@@ -40,6 +40,7 @@ class SimulationSpec:
     image_noise: float = 1.0
     supersampling: int = 2
     ground_truth_depth: bool = True
+    novel_views: int = 0
     seed: int = 0
     path: PathPlan | None = None
 
@@ -48,6 +49,8 @@ class SimulationSpec:
             raise ConfigError(f"depth sensor '{self.depth}' is unknown; choose one of {', '.join(DEPTHS)}")
         if self.lidar != "none" and self.lidar not in LIDARS:
             raise ConfigError(f"lidar '{self.lidar}' is unknown; choose none, {', '.join(LIDARS)}")
+        if not 0 <= self.novel_views <= self.frames:
+            raise ConfigError(f"novel_views must lie between 0 and the {self.frames} frames, got {self.novel_views}")
         if min(self.frames, self.fps, self.lidar_hz, self.supersampling) <= 0 or self.image_noise < 0:
             raise ConfigError("frames, fps, lidar_hz and supersampling of a simulation must be positive")
 

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 import torch
 
-from sf_interfaces.types import Float32, UInt8
+from sf_depth.config import DepthConfig
+from sf_interfaces.types import UInt8
 
 _JITTER = 1e-8  # under the root, so that the kernel is smooth at zero distance
 
@@ -23,8 +24,8 @@ _JITTER = 1e-8  # under the root, so that the kernel is smooth at zero distance
 class PixelCovariance:
     """Neighbourhood shapes E [H, W, 3] (xx, xy, yy) px^2 and features [H, W, C], unit scale."""
 
-    shape: Float32
-    feature: Float32
+    shape: torch.Tensor
+    feature: torch.Tensor
 
 
 class CovarianceModel(Protocol):
@@ -56,7 +57,9 @@ class StructureCovariance:
         xx, xy, yy = 1.0 + gain * products[..., 0], gain * products[..., 1], 1.0 + gain * products[..., 2]
         scale = length_px**2 / (xx * yy - xy * xy)
         shape = np.stack([yy * scale, -xy * scale, xx * scale], axis=-1)
-        return PixelCovariance(shape.astype(np.float32), feature / np.float32(self.color_scale))
+        return PixelCovariance(
+            torch.from_numpy(shape.astype(np.float32)), torch.from_numpy(feature / np.float32(self.color_scale))
+        )
 
 
 def kernel(
@@ -81,3 +84,8 @@ def kernel(
     squares = (c1 * c1).sum(dim=2)[:, :, None] + (c2 * c2).sum(dim=2)[:, None]
     color = (squares - 2.0 * c1 @ c2.transpose(1, 2)).clamp_min(0.0)
     return norm * (1.0 + r) * torch.exp(-r - 0.5 * color)
+
+
+def make_covariance(config: DepthConfig) -> CovarianceModel:
+    """The covariance that the configuration names."""
+    return StructureCovariance(config.covariance_color_scale, config.edge_strength)

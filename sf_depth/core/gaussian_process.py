@@ -1,7 +1,7 @@
 """Gaussian-process regression of a scale image, tile by tile (paper Sec. ScaleCov, both GP equations).
 
-Every tile of pixels is conditioned on its nearest observations. The regressed scale is ``base / z``: inverse
-depth is linear on a plane, so a linear prior makes planes exact at any slant.
+``s_* = K_fn (K_nn + sigma_n^2 I)^-1 s_n`` and ``Sigma_* = K_ff - K_fn (K_nn + sigma_n^2 I)^-1 K_nf``, where n are
+the observations a tile is conditioned on and f its pixels; s is what the mean leaves of log(z / base).
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -9,98 +9,52 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 
-from sf_depth.core.covariance import PixelCovariance, kernel
-from sf_interfaces.types import Float32, Float64
+from sf_depth.core.covariance import kernel
 
-_CHUNK = 256  # tiles solved at once; few enough to stay in the processor's cache
 _PRIOR_COUNT = 8.0  # how many observations the image-wide amplitude weighs in a tile's own
 
 
 @dataclass(frozen=True, slots=True)
-class Observations:
-    """Measured pixels: integer (row, col) [N, 2] and depth [N] m."""
+class Points:
+    """Pixels as the kernel sees them: x [B, N, 2] px, shape E [B, N, 3] px^2, feature [B, N, C]."""
 
-    index: np.ndarray
-    z: Float32
+    x: torch.Tensor
+    E: torch.Tensor
+    feature: torch.Tensor
+
+
+def kernel_of(a: Points, b: Points) -> torch.Tensor:
+    """Correlation [B, N, M] of two sets of pixels."""
+    return kernel(a.x, a.E, a.feature, b.x, b.E, b.feature)
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
-    """Tiles conditioned on their observations."""
+class Conditioned:
+    """Tiles conditioned on ``K`` observations each."""
 
-    x: torch.Tensor  # [B, K, 2] px, relative to the tile's centre
-    E: torch.Tensor  # [B, K, 3] px^2
-    feature: torch.Tensor  # [B, K, C]
-    radius: torch.Tensor  # [B, 1, 1] px, distance of the farthest observation
-    base: torch.Tensor  # [B] m, harmonic mean depth
-    scale: torch.Tensor  # [B, K] base / z
-    inverse: torch.Tensor  # [B, K, K] (K_nn + nugget I)^-1
-    alpha: torch.Tensor  # [B, K] inverse @ (scale - 1)
+    n: Points
+    s: torch.Tensor  # [B, K]
+    inverse: torch.Tensor  # [B, K, K] (K_nn + sigma_n^2 I)^-1
+    alpha: torch.Tensor  # [B, K] inverse @ s
 
-    @property
-    def amplitude(self) -> torch.Tensor:
-        """Prior variance that maximises each tile's marginal likelihood (closed form), [B]."""
-        return ((self.scale - 1.0) * self.alpha).mean(dim=1)
+    def amplitude(self, typical: float) -> torch.Tensor:
+        """Prior variance of the greatest marginal likelihood, drawn to the image's ``typical`` one, [B]."""
+        count = self.s.shape[1]
+        return ((self.s * self.alpha).sum(dim=1) + _PRIOR_COUNT * typical) / (count + _PRIOR_COUNT)
 
 
-def _trend(x1: torch.Tensor, x2: torch.Tensor, radius: torch.Tensor) -> torch.Tensor:
-    """Covariance of an unknown plane in inverse depth, [B, N, M]."""
-    return 1.0 + (x1 @ x2.transpose(1, 2)) / radius**2
+def condition(n: Points, s: torch.Tensor, noise: torch.Tensor) -> Conditioned:
+    """Solve for observations ``s`` [B, K] of noise variance ``noise`` [B, K], relative to the prior's."""
+    K_nn = kernel_of(n, n)
+    K_nn.diagonal(dim1=1, dim2=2).add_(noise)
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky(K_nn))
+    return Conditioned(n, s, inverse, (inverse @ s[..., None])[..., 0])
 
 
-def _gather(pixels: PixelCovariance, index: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
-    row, col = index[..., 0], index[..., 1]
-    return torch.from_numpy(pixels.shape[row, col]), torch.from_numpy(pixels.feature[row, col])
-
-
-def solve(observed: Observations, near: np.ndarray, center: Float64, pixels: PixelCovariance, nugget: float) -> Solved:
-    """Condition tiles with centres [B, 2] (row, col) on the observations ``near`` [B, K]."""
-    index = observed.index[near]
-    x = torch.from_numpy((index - center[:, None]).astype(np.float32))[..., [1, 0]]
-    E, feature = _gather(pixels, index)
-    inverse_depth = torch.from_numpy(1.0 / observed.z[near])
-    mean = inverse_depth.mean(dim=1, keepdim=True)
-    scale = inverse_depth / mean
-    radius = x.norm(dim=2).amax(dim=1).clamp_min(1.0)[:, None, None]
-    K = kernel(x, E, feature, x, E, feature) + _trend(x, x, radius)
-    K.diagonal(dim1=1, dim2=2).add_(nugget)
-    inverse = torch.cholesky_inverse(torch.linalg.cholesky(K))
-    alpha = (inverse @ (scale - 1.0)[..., None])[..., 0]
-    return Solved(x, E, feature, radius, 1.0 / mean[:, 0], scale, inverse, alpha)
-
-
-def predict(
-    tiles: Solved, query: np.ndarray, center: Float64, pixels: PixelCovariance, amplitude: torch.Tensor
-) -> tuple[Float32, Float32]:
-    """Depth [B, M] m and variance [B, M] m^2 of the pixels ``query`` [B, M, 2] (row, col) of each tile."""
-    x = torch.from_numpy((query - center[:, None]).astype(np.float32))[..., [1, 0]]
-    E, feature = _gather(pixels, query)
-    K = kernel(x, E, feature, tiles.x, tiles.E, tiles.feature) + _trend(x, tiles.x, tiles.radius)
-    scale = 1.0 + (K @ tiles.alpha[..., None])[..., 0]
-    prior = 2.0 + (x * x).sum(dim=2) / tiles.radius[..., 0] ** 2
-    left = prior - ((K @ tiles.inverse) * K).sum(dim=2)
-    variance = left.clamp_min(0.0) * amplitude[:, None]
-    low, high = tiles.scale.amin(dim=1, keepdim=True), tiles.scale.amax(dim=1, keepdim=True)
-    scale = torch.minimum(torch.maximum(scale, 0.8 * low), 1.25 * high)  # a plane may not leave the scene
-    z = tiles.base[:, None] / scale
-    return z.numpy(), (z**2 * variance / scale**2).numpy()
-
-
-def leave_one_out(tiles: Solved) -> tuple[torch.Tensor, torch.Tensor]:
-    """Error and unit-amplitude variance of each tile's nearest observation, given its others, [B]."""
-    own = tiles.inverse[:, 0, 0]
-    return tiles.alpha[:, 0] / own, 1.0 / own
-
-
-def amplitudes(tiles: Solved, typical: float) -> torch.Tensor:
-    """Each tile's own amplitude drawn towards the image's typical one, [B]."""
-    count = tiles.scale.shape[1]
-    return (count * tiles.amplitude + _PRIOR_COUNT * typical) / (count + _PRIOR_COUNT)
-
-
-def chunks(count: int) -> list[slice]:
-    """Slices over ``count`` tiles that fit in memory."""
-    return [slice(start, start + _CHUNK) for start in range(0, count, _CHUNK)]
+def predict(tiles: Conditioned, f: Points) -> tuple[torch.Tensor, torch.Tensor]:
+    """s_* and the diagonal of Sigma_* at unit amplitude, [B, M] each."""
+    K_nf = kernel_of(tiles.n, f)  # [B, K, M]
+    mean = (tiles.alpha[..., None] * K_nf).sum(dim=1)
+    return mean, (1.0 - (K_nf * (tiles.inverse @ K_nf)).sum(dim=1)).clamp_min(0.0)

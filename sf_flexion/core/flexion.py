@@ -6,103 +6,110 @@ Bright is flat, dark is an edge, a crease or no data. It replaces the colour ima
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import cv2
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from sf_flexion.config import FlexionConfig
+from sf_flexion.core.median import median
+from sf_flexion.core.noise import choose_step
 from sf_interfaces.errors import CalibrationError
-from sf_interfaces.types import Camera, DepthMap, Float32, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float32
 
-_STRIP_ROWS = 64  # rows filtered at once where the median must skip missing pixels: bounds memory
+_STRIP_PIXELS = 1 << 14  # computed at once: all intermediate images stay in the cache
 
-
-def flexion_image(depth: DepthMap, camera: Camera, config: FlexionConfig) -> UInt8:
-    """Flexion of a depth map, uint8 [H, W]: 255 on a fronto-parallel plane, 0 where a neighbour is missing.
-
-    Raises:
-        CalibrationError: the depth map does not have the camera's size.
-    """
-    if depth.z.shape != (camera.height, camera.width):
-        raise CalibrationError(
-            f"depth is {depth.z.shape[1]}x{depth.z.shape[0]} but its camera {camera.width}x{camera.height}; "
-            "give the calibration of the depth image"
-        )
-    z = np.where(depth.valid, depth.z, np.nan).astype(np.float32)
-    points = _range_points(_median(z, config.median), camera)
-    value = _flexion(points, config.step, config.variant)
-    return np.rint(np.nan_to_num(value) * 255.0).astype(np.uint8)
+Vector = tuple[Float32, Float32, Float32]
+"""x, y and z of a vector per pixel, apart: three plain images are faster than one with three channels."""
 
 
-def _median(z: Float32, size: int) -> Float32:
-    """Median of the valid pixels of each ``size`` x ``size`` window; a missing centre stays missing."""
-    if size == 1:
-        return z
-    missing = ~np.isfinite(z)
-    holes = cv2.dilate(missing.astype(np.uint8), np.ones((size, size), np.uint8)).astype(bool)
-    out = _median_dense(np.where(missing, np.float32(0), z), size)
-    rows, cols = np.nonzero(holes & ~missing)  # windows with a hole: rank the valid pixels only
-    r = size // 2
-    padded = np.pad(z, r, constant_values=np.nan)
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size))
-    block = _STRIP_ROWS * z.shape[1]
-    for start in range(0, len(rows), block):
-        part = slice(start, start + block)
-        ranked = np.sort(windows[rows[part], cols[part]].reshape(-1, size * size), axis=1)  # NaN sorts last
-        count = np.isfinite(ranked).sum(axis=1)
-        low = np.take_along_axis(ranked, ((count - 1) // 2)[:, None], axis=1)[:, 0]
-        high = np.take_along_axis(ranked, (count // 2)[:, None], axis=1)[:, 0]
-        out[rows[part], cols[part]] = 0.5 * (low + high)
-    out[missing] = np.nan
-    return out
+class Flexion:
+    """Depth maps of one camera to flexion images; remembers the step that suits its noise (``step: 0``)."""
+
+    def __init__(self, config: FlexionConfig) -> None:
+        self._config = config
+        self.step: int | None = config.step or None
+
+    def __call__(self, depth: DepthMap, camera: Camera) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """The flexion image [H, W], uint8 or (``bits: 16``) uint16: full on a plane, 0 where unknown.
+
+        Raises:
+            CalibrationError: the depth map does not have the camera's size.
+        """
+        full, kind = (65535, np.uint16) if self._config.bits == 16 else (255, np.uint8)
+        image = np.zeros(depth.z.shape, kind)
+        for inner, value in self._strips(depth, camera):
+            value[np.isnan(value)] = 0.0
+            image[inner] = np.rint(np.multiply(value, np.float32(full), out=value), out=value)
+        return image
+
+    def value(self, depth: DepthMap, camera: Camera) -> Float32:
+        """The flexion [H, W] itself, in 0..1; NaN where one of the eight neighbours has no depth.
+
+        Raises:
+            CalibrationError: the depth map does not have the camera's size.
+        """
+        out = np.full(depth.z.shape, np.nan, dtype=np.float32)
+        for inner, value in self._strips(depth, camera):
+            out[inner] = value
+        return out
+
+    def _strips(self, depth: DepthMap, camera: Camera) -> Iterator[tuple[tuple[slice, slice], Float32]]:
+        """Where in the image, and its flexion, strip by strip; the border of ``step`` px has none."""
+        height, width = depth.z.shape
+        if (height, width) != (camera.height, camera.width):
+            raise CalibrationError(
+                f"depth is {width}x{height} but its camera {camera.width}x{camera.height}; "
+                "give the calibration of the depth image"
+            )
+        z = median(np.where(depth.valid, depth.z, np.float32(np.nan)), self._config.median)
+        n = self.step = self._config.step or choose_step(z, camera, self.step)
+        if height <= 2 * n or width <= 2 * n:
+            return
+        x = ((np.arange(width) + 0.5 - camera.cx) / camera.fx).astype(np.float32)
+        y = ((np.arange(height) + 0.5 - camera.cy) / camera.fy).astype(np.float32)[:, None]
+        count = max(8, _STRIP_PIXELS // width)
+        for top in range(n, height - n, count):
+            end = min(top + count, height - n)
+            rows = slice(top - n, end + n)
+            points = (z[rows] * x, z[rows] * y[rows], z[rows])  # range times unit ray: the surface points, m
+            yield np.s_[top:end, n:-n], _agreement(points, n, self._config.variant)
 
 
-def _median_dense(z: Float32, size: int) -> Float32:
-    """Plain median filter, edges replicated. float32 is filtered natively up to 5 x 5."""
-    if size <= 5:
-        return cv2.medianBlur(z, size)
-    r = size // 2
-    out = np.empty_like(z)
-    padded = np.pad(z, r, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(padded, (size, size))
-    for top in range(0, z.shape[0], _STRIP_ROWS):
-        strip = windows[top : top + _STRIP_ROWS]
-        out[top : top + _STRIP_ROWS] = np.median(strip.reshape(*strip.shape[:2], -1), axis=2)
-    return out
+def flexion_image(depth: DepthMap, camera: Camera, config: FlexionConfig) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """One depth map to its flexion image; see :class:`Flexion`."""
+    return Flexion(config)(depth, camera)
 
 
-def _range_points(z: Float32, camera: Camera) -> Float32:
-    """Range times unit ray: the surface points themselves, [H, W, 3] m."""
-    return camera.unproject(camera.pixel_grid(), z.astype(np.float64)).astype(np.float32)
+def _agreement(points: Vector, n: int, variant: str) -> Float32:
+    """n0 . n1 of the four central differences of a strip, by variant; the border of ``n`` px is left out."""
+    height, width = points[0].shape
 
+    def difference(du: int, dv: int) -> Vector:
+        ahead = np.s_[n + dv : height - n + dv, n + du : width - n + du]
+        behind = np.s_[n - dv : height - n - dv, n - du : width - n - du]
+        x, y, z = (p[ahead] - p[behind] for p in points)
+        return x, y, z
 
-def _unit(v: Float32) -> Float32:
-    """Unit vectors; a vector of no length has no direction and becomes NaN."""
-    length = np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
+    a, b, c, e = difference(0, n), difference(n, 0), difference(-n, n), difference(n, n)
+    n0, n1 = _cross(a, b), _cross(c, e)
+    lengths = (n0, n1) if variant != "standard" else (a, b, c, e)
+    value = _dot(n0, n1)
+    # A direction without length, or a normal without area, gives 0 / 0: unknown, as it should be.
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(length > 0, v / length, np.float32(np.nan))
-
-
-def _flexion(points: Float32, n: int, variant: str) -> NDArray[np.float32]:
-    """Agreement of the normals of the straight and of the diagonal cross, [H, W] in 0..1, NaN = unknown."""
-    height, width = points.shape[:2]
-    value = np.full((height, width), np.nan, dtype=np.float32)
-    if height <= 2 * n or width <= 2 * n:
-        return value
-
-    def at(du: int, dv: int) -> Float32:
-        return points[n + dv : height - n + dv, n + du : width - n + du]
-
-    a = _unit(at(0, n) - at(0, -n))
-    b = _unit(at(n, 0) - at(-n, 0))
-    c = _unit(at(-n, n) - at(n, -n))
-    e = _unit(at(n, n) - at(-n, -n))
-    n0, n1 = np.cross(a, b), np.cross(c, e)
-    if variant != "standard":
-        n0, n1 = _unit(n0), _unit(n1)
-    dot = np.einsum("...i,...i->...", n0, n1)
+        for vector in lengths:
+            value /= np.sqrt(_dot(vector, vector))
     if variant == "angle":
-        value[n:-n, n:-n] = 1.0 - np.arccos(np.clip(dot, -1.0, 1.0)) / np.pi
-    else:
-        value[n:-n, n:-n] = np.clip(np.abs(dot), 0.0, 1.0)
-    return value
+        return 1.0 - np.arccos(np.clip(value, -1.0, 1.0)) / np.float32(np.pi)
+    return np.minimum(np.abs(value, out=value), np.float32(1.0), out=value)
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _dot(a: Vector, b: Vector) -> Float32:
+    out = a[0] * b[0]
+    out += a[1] * b[1]
+    out += a[2] * b[2]
+    return out

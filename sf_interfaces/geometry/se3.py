@@ -124,3 +124,8 @@ def interpolate(T_0: Array, T_1: Array, alpha: float | Array) -> Array:
     step = log(inverse(T_0) @ T_1)
     a = np.asarray(alpha, dtype=np.float64)[..., None]
     return T_0 @ exp(a * step)
+
+
+def twist_between(t0_ns: int, T0: Array, t1_ns: int, T1: Array) -> Array:
+    """Constant twist [6] (m/s, rad/s) in the moving frame that carries T0 at t0 into T1 at t1."""
+    return log(inverse(T0) @ T1) / ((t1_ns - t0_ns) / 1_000_000_000)

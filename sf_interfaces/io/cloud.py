@@ -9,11 +9,11 @@ import numpy as np
 import open3d as o3d
 
 from sf_interfaces.errors import FormatError
-from sf_interfaces.types import PointCloud
+from sf_interfaces.types import Float32, PointCloud
 
 
-def write_surface(path: Path, cloud: PointCloud) -> None:
-    """Write points with colour as PLY.
+def write_surface(path: Path, cloud: PointCloud, normals: Float32 | None = None) -> None:
+    """Write points with colour, and normals [N, 3] where given, as PLY.
 
     Raises:
         FormatError: the file cannot be written.
@@ -21,5 +21,7 @@ def write_surface(path: Path, cloud: PointCloud) -> None:
     out = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.points.astype(np.float64)))
     if cloud.colors is not None:
         out.colors = o3d.utility.Vector3dVector(cloud.colors / 255.0)
+    if normals is not None:
+        out.normals = o3d.utility.Vector3dVector(normals.astype(np.float64))
     if not o3d.io.write_point_cloud(path, out):
         raise FormatError(f"cannot write {path}; choose a folder that can be written")

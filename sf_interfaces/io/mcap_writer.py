@@ -114,6 +114,12 @@ class McapWriter:
         """The type of a topic that has been written."""
         return next(kind for name, kind in self._channels if name == topic)
 
+    @property
+    def unwritten(self) -> Counter[str]:
+        """Messages of each topic that were given but have not reached the file yet."""
+        names = {channel.id: channel.topic for channel in self._channels.values()}
+        return Counter({names[channel]: len(records) for channel, records in self._chunk_index.items()})
+
     def _reset_chunk(self) -> None:
         self._pieces: list[bytes] = []
         self._size = 0

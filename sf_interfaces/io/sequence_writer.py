@@ -9,6 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from sf_interfaces.geometry.undistort import Distortion
 from sf_interfaces.io.definitions import typestore
 from sf_interfaces.io.mcap_writer import McapWriter
 from sf_interfaces.ros import messages
@@ -58,9 +59,9 @@ class SequenceWriter:
         """All poses of a trajectory as nav_msgs/Path."""
         self._write(topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns))
 
-    def camera_info(self, topic: str, stamp_ns: int, camera: Camera) -> None:
-        """Intrinsics, in the camera's frame."""
-        self._write(topic, _INFO, stamp_ns, messages.encode_camera_info(self._make, camera, stamp_ns))
+    def camera_info(self, topic: str, stamp_ns: int, camera: Camera, distortion: Distortion | None = None) -> None:
+        """Intrinsics and the lens distortion still in the image, in the camera's frame."""
+        self._write(topic, _INFO, stamp_ns, messages.encode_camera_info(self._make, camera, stamp_ns, distortion))
 
     def cloud(self, topic: str, cloud: PointCloud, intensity: NDArray[Any] | None = None) -> None:
         """Points with the cloud's own stamp and frame."""

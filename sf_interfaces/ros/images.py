@@ -1,4 +1,4 @@
-"""sensor_msgs/Image <-> uint8 images and depth maps."""
+"""sensor_msgs/Image <-> uint8 images and depth maps; CompressedImage is read wherever an Image is."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sf_interfaces.errors import FormatError
+from sf_interfaces.ros.compressed import is_compressed, unpack
 from sf_interfaces.ros.stamps import Factory, header, sequence
 from sf_interfaces.types import DepthMap, UInt8
 
@@ -65,17 +66,20 @@ def is_depth_encoding(encoding: str) -> bool:
 
 
 def decode_image(msg: Any) -> UInt8:
-    """sensor_msgs/Image -> RGB [H, W, 3] or mono [H, W] uint8.
+    """sensor_msgs/Image or CompressedImage -> RGB [H, W, 3] or mono [H, W] uint8.
 
     Colour comes out as RGB whatever the encoding; of mono16 the upper byte is kept.
 
     Raises:
-        FormatError: an encoding that is no picture, or a step or length that does not fit the size.
+        FormatError: an encoding that is no picture, a step or length that does not fit the size, or damaged data.
     """
-    if msg.encoding not in _IMAGE:
-        hint = "it is depth" if msg.encoding in _DEPTH else f"known: {', '.join(_IMAGE)}"
-        raise FormatError(f"cannot read encoding '{msg.encoding}' as a picture ({hint}); choose another topic")
-    dtype, channels, conversion = _IMAGE[msg.encoding]
+    unpacked, encoding = unpack(msg) if is_compressed(msg) else (None, msg.encoding)
+    if encoding not in _IMAGE:
+        hint = "it is depth" if encoding in _DEPTH else f"known: {', '.join(_IMAGE)}"
+        raise FormatError(f"cannot read encoding '{encoding}' as a picture ({hint}); choose another topic")
+    dtype, channels, conversion = _IMAGE[encoding]
+    if unpacked is not None:
+        return np.right_shift(unpacked, 8).astype(np.uint8) if dtype == "u2" else unpacked
     pixels = _pixels(msg, dtype, channels)
     if dtype == "u2":
         return np.right_shift(pixels, 8).astype(np.uint8)
@@ -90,17 +94,18 @@ def decode_image(msg: Any) -> UInt8:
 
 
 def decode_depth(msg: Any) -> DepthMap:
-    """sensor_msgs/Image -> depth in metres, by REP-118.
+    """sensor_msgs/Image or CompressedImage -> depth in metres, by REP-118.
 
     16UC1 is millimetres with 0 (and 65535, saturated) invalid, 32FC1 is metres; whatever is not finite
     and positive becomes NaN.
 
     Raises:
-        FormatError: an encoding that is no depth, or a step or length that does not fit the size.
+        FormatError: an encoding that is no depth, a step or length that does not fit the size, or damaged data.
     """
-    if msg.encoding not in _DEPTH:
-        raise FormatError(f"cannot read encoding '{msg.encoding}' as depth (16UC1 mm or 32FC1 m); choose another topic")
-    pixels = _pixels(msg, _DEPTH[msg.encoding], 1)
+    unpacked, encoding = unpack(msg) if is_compressed(msg) else (None, msg.encoding)
+    if encoding not in _DEPTH:
+        raise FormatError(f"cannot read encoding '{encoding}' as depth (16UC1 mm or 32FC1 m); choose another topic")
+    pixels = _pixels(msg, _DEPTH[encoding], 1) if unpacked is None else unpacked
     if pixels.dtype.kind == "u":
         z = pixels.astype(np.float32) * np.float32(1e-3)
         z[(pixels == 0) | (pixels == _MILLIMETRES_FULL)] = np.nan
@@ -124,16 +129,19 @@ def _image(make: Factory, pixels: NDArray[Any], encoding: str, stamp_ns: int, fr
     )
 
 
-def encode_image(make: Factory, image: UInt8, stamp_ns: int, frame_id: str) -> Any:
-    """RGB [H, W, 3] -> rgb8, mono [H, W] -> mono8.
+def encode_image(make: Factory, image: UInt8 | NDArray[np.uint16], stamp_ns: int, frame_id: str) -> Any:
+    """RGB [H, W, 3] uint8 -> rgb8, mono [H, W] -> mono8 (uint8) or mono16 (uint16).
 
     Raises:
-        FormatError: not uint8 of one of these shapes.
+        FormatError: another type or shape.
     """
     image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise FormatError(f"image must be uint8 (H, W) or (H, W, 3), got {image.dtype} {image.shape}")
-    return _image(make, image, "rgb8" if image.ndim == 3 else "mono8", stamp_ns, frame_id)
+    encoding = {("uint8", 3): "rgb8", ("uint8", 2): "mono8", ("uint16", 2): "mono16"}.get(
+        (image.dtype.name, image.ndim)
+    )
+    if encoding is None or (image.ndim == 3 and image.shape[2] != 3):
+        raise FormatError(f"image must be uint8 (H, W) or (H, W, 3), or uint16 (H, W), got {image.dtype} {image.shape}")
+    return _image(make, image, encoding, stamp_ns, frame_id)
 
 
 def encode_depth(make: Factory, depth: DepthMap, stamp_ns: int, frame_id: str, encoding: str = "32FC1") -> Any:

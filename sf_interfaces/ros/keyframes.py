@@ -3,11 +3,13 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 from sf_interfaces.errors import ConfigError
+from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.ros.bundles import COMPLETED, TRACKED, BundleInputs
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.sensors import SensorInputs
@@ -23,6 +25,7 @@ class KeyframeSource:
 
     def __init__(self, node: BlockNode, *, landmarks: bool) -> None:
         self._sensors: SensorInputs | None = None
+        self._done = _Progress(node)
         source = node.options.source
         if source == "sensors":
             # As the head of its line the node needs the pose from outside.
@@ -48,7 +51,7 @@ class KeyframeSource:
         """
         if self._sensors is None:
             keyframe = self._bundles.push(kind, msg)
-            if keyframe is not None:
+            if keyframe is not None and keyframe.stamp_ns > self._done.stamp_ns:
                 yield keyframe
             return
         self._sensors.push(kind, msg)
@@ -62,6 +65,10 @@ class KeyframeSource:
         self._sensors.assembler.end()
         yield from map(_posed, self._sensors.assembler.ready())
 
+    def done(self, stamp_ns: int) -> None:
+        """Everything up to this keyframe is dealt with and safe: a successor of this process need not repeat it."""
+        self._done.write(stamp_ns)
+
     @property
     def reasons(self) -> dict[str, int]:
         """Why input was dropped, with counts."""
@@ -72,6 +79,20 @@ class KeyframeSource:
     def waiting_for(self) -> str:
         """What the oldest image still lacks, in words."""
         return "" if self._sensors is None else self._sensors.assembler.waiting_for
+
+
+class _Progress:
+    """The last keyframe that is dealt with, on disk. After a restart upstream sends its last ones again."""
+
+    def __init__(self, node: BlockNode) -> None:
+        name = f"{node.short}.json"
+        self._path, found = node.state(name), node.snapshot(name)
+        self.stamp_ns = int(json.loads(found.read_text())["stamp_ns"]) if found is not None else -1
+
+    def write(self, stamp_ns: int) -> None:
+        if self._path is not None:
+            with replace_file(self._path) as draft:
+                draft.write_text(json.dumps({"stamp_ns": stamp_ns}))
 
 
 def _posed(frame: Frame) -> Keyframe:

@@ -16,6 +16,7 @@ from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.undistort import Distortion
 from sf_interfaces.ros.clouds import decode_cloud, decode_field, encode_cloud
+from sf_interfaces.ros.compressed import COMPRESSED_IMAGE, encoding_of
 from sf_interfaces.ros.images import (
     decode_depth,
     decode_image,
@@ -29,6 +30,7 @@ from sf_interfaces.ros.stamps import Factory, header, sequence, to_ns, to_stamp
 from sf_interfaces.types import Camera, Float64, Trajectory
 
 __all__ = [
+    "COMPRESSED_IMAGE",
     "Distortion",
     "Factory",
     "decode_camera_info",
@@ -47,6 +49,7 @@ __all__ = [
     "encode_pose",
     "encode_tf",
     "encode_variance",
+    "encoding_of",
     "header",
     "is_depth_encoding",
     "rclpy_factory",

@@ -45,6 +45,7 @@ class NodeOptions:
     lossless: bool = option(False, "replay: drop nothing, decide nothing by waiting")
     autostart: bool = option(False, "configure and activate without an orchestrator")
     out: str = option("", "folder for this node's files, written at the end (empty: none)")
+    resume: bool = option(False, "go on from the snapshot that a node of this name left in out/state")
 
 
 def stamp_of(raw: bytes) -> int:
@@ -123,6 +124,15 @@ class BlockNode(LifecycleNode):
         path = Path(self.options.out)
         path.mkdir(parents=True, exist_ok=True)
         return path
+
+    def state(self, name: str) -> Path | None:
+        """Where a live node keeps a file that a successor process needs; None: replays keep none."""
+        return None if self.out is None or self.options.lossless else self.out / "state" / name
+
+    def snapshot(self, name: str) -> Path | None:
+        """The file that a predecessor of this process left under :meth:`state`, if it is to be gone on from."""
+        path = self.state(name)
+        return path if self.options.resume and path is not None and path.is_file() else None
 
     def listen(self, topic: Topic, kind: str, keep: int | None = None) -> None:
         """Take in a topic while active; ``keep`` bounds the queue (latest wins), None never drops."""
@@ -281,7 +291,8 @@ class BlockNode(LifecycleNode):
             self._stalled += 1
             lost = self._announced - self._least_received()
             if self._stalled >= _STALL_REPORTS or not self.options.lossless:
-                self.health.drop(f"{self.leader} announced by upstream but never received", lost)
+                if not self.options.resume:  # what came before the restart was another process's
+                    self.health.drop(f"{self.leader} announced by upstream but never received", lost)
                 self._end_input()
         self.health.value("queue", len(self._inbox))
         self.health.value("stream", "finished" if self._finished else "running" if self._active else "inactive")

@@ -7,6 +7,7 @@ import ctypes
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from types import FrameType
 
@@ -19,7 +20,8 @@ from sf_interfaces.ros.node import BlockNode
 
 _PR_SET_PDEATHSIG = 1
 _SPIN_S = 0.1
-_STOP_S = 0.6  # for the worker to complete after a signal; the process is gone within 1 s
+_STOP_S = 0.6  # for the worker to complete after SIGTERM; the process is gone within 1 s
+_SAVE_S = 60.0  # after SIGINT, for a live node to write its results; SIGTERM ends that too
 
 
 def die_with_parent() -> None:
@@ -59,7 +61,7 @@ def run(make: Callable[[], BlockNode], args: list[str] | None = None) -> int:
     while not stopping and node.exit_code is None and os.getppid() == parent:
         executor.spin_once(timeout_sec=_SPIN_S)
     code = node.exit_code or 0
-    if not node.stop(_STOP_S):
+    if not _finished(node, stopping):
         sys.stderr.flush()
         # The worker is inside a long computation: its results are given up, as the signal asks.
         os._exit(code)
@@ -67,3 +69,15 @@ def run(make: Callable[[], BlockNode], args: list[str] | None = None) -> int:
     node.destroy_node()
     rclpy.shutdown()
     return code
+
+
+def _finished(node: BlockNode, signals: list[int]) -> bool:
+    """Let the worker complete; True if it did before its time was over or another signal came."""
+    patient = signals[:1] == [signal.SIGINT] and node.state("") is not None
+    deadline = time.monotonic() + (_SAVE_S if patient else _STOP_S)
+    while not node.stop(_SPIN_S):
+        if patient and signal.SIGTERM in signals:
+            patient, deadline = False, min(deadline, time.monotonic() + _STOP_S)
+        if time.monotonic() > deadline:
+            return False
+    return True

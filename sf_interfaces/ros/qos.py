@@ -8,6 +8,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from sf_interfaces.topics import Qos
 
 _LOSSLESS_DEPTH = 1000  # messages DDS may hold; credits keep far fewer images in flight
+_KEYFRAMES_KEPT = 30  # more than a reconstruction takes in between two of its snapshots
 
 
 def _profile(depth: int, *, reliable: bool = True, latched: bool = False) -> QoSProfile:
@@ -30,6 +31,8 @@ def qos_profile(kind: Qos, *, lossless: bool = False) -> QoSProfile:
             return _profile(_LOSSLESS_DEPTH) if lossless else _profile(5, reliable=False)
         case Qos.RELIABLE:
             return _profile(_LOSSLESS_DEPTH if lossless else 100)
+        case Qos.KEYFRAME:
+            return _profile(_LOSSLESS_DEPTH) if lossless else _profile(_KEYFRAMES_KEPT, latched=True)
         case Qos.LATEST:
             return _profile(1)
         case Qos.LATCHED:

@@ -50,6 +50,8 @@ class SensorInputs:
             ("image", topics.RGB_IMAGE, config.image),
         ):
             if wanted:
+                if kind in config.compressed:
+                    topic = replace(topic, type=messages.COMPRESSED_IMAGE)
                 yield topic, kind, None if self._lossless else _KEEP[kind]
 
     def push(self, kind: str, msg: Any) -> None:
@@ -70,7 +72,7 @@ class SensorInputs:
                 stamp_ns, _, T = messages.decode_pose(msg)
                 a.push_pose(stamp_ns, T)
             case "camera_info":
-                a.push_camera(*messages.decode_camera_info(msg))
+                a.push_camera(*messages.decode_camera_info(msg), messages.to_ns(msg.header.stamp))
             case "tf" | "tf_static":
                 for parent, child, stamp_ns, T in messages.decode_tf(msg):
                     a.push_transform(parent, child, T, stamp_ns, static=kind == "tf_static")

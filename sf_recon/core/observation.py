@@ -23,6 +23,8 @@ class Observation:
     points: Float32  # [M, 3] m, map frame
     colors: Float32  # [M, 3] in 0..1
     weights: Float32  # [M] inverse variance relative to the mean, mean 1
+    sigmas: Float32  # [M] m, standard deviation of the depth; where unknown, the pixel's footprint
+    footprints: Float32  # [M] m, width of the surface that a pixel sees head-on
 
 
 def rgb(image: UInt8) -> UInt8:
@@ -30,12 +32,16 @@ def rgb(image: UInt8) -> UInt8:
     return image if image.ndim == 3 else np.repeat(image[:, :, None], 3, axis=2)
 
 
-def to_map(camera: Camera, T_map_camera: Float64, z: Float32, pixels: NDArray[np.intp]) -> Float32:
-    """Points [M, 3] m (map frame) of flat pixel indices [M] with the depth image z [H, W]."""
+def backproject(camera: Camera, T_map_camera: Float64, z: Float32, pixels: NDArray[np.intp]) -> tuple[Float32, Float32]:
+    """Points [M, 3] m and unit viewing directions [M, 3], map frame, of flat pixel indices [M] with depth z [M]."""
+    R = T_map_camera[:3, :3].astype(np.float32)
     row, column = np.divmod(pixels, camera.width)
-    uv = np.stack([column + 0.5, row + 0.5], axis=-1)
-    local = camera.unproject(uv, z.reshape(-1)[pixels].astype(np.float64))
-    return (local @ T_map_camera[:3, :3].T + T_map_camera[:3, 3]).astype(np.float32)
+    rays = np.empty((len(pixels), 3), np.float32)
+    rays[:, 0] = (column + 0.5 - camera.cx) / camera.fx
+    rays[:, 1] = (row + 0.5 - camera.cy) / camera.fy
+    rays[:, 2] = 1
+    points = (rays * z[:, None]) @ R.T + T_map_camera[:3, 3].astype(np.float32)
+    return points, (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ R.T
 
 
 def observe(keyframe: Keyframe, config: ReconConfig) -> Observation:
@@ -63,11 +69,15 @@ def observe(keyframe: Keyframe, config: ReconConfig) -> Observation:
         weights = (largest / np.maximum(known, _SIGMA_FLOOR**2 * largest)).astype(np.float32)
     pixels = np.flatnonzero(usable)
     kept = weights[pixels]
+    footprints = (depth.z.reshape(-1)[pixels] / np.sqrt(camera.fx * camera.fy)).astype(np.float32)
+    sigmas = footprints if depth.variance is None else np.sqrt(depth.variance.reshape(-1)[pixels])
     return Observation(
         pixels=pixels,
-        points=to_map(camera, keyframe.T_map_camera, depth.z, pixels),
+        points=backproject(camera, keyframe.T_map_camera, depth.z.reshape(-1)[pixels], pixels)[0],
         colors=rgb(keyframe.image).reshape(-1, 3)[pixels].astype(np.float32) / np.float32(255),
         weights=(kept / max(float(kept.mean()), 1e-12) if len(kept) else kept).astype(np.float32),
+        sigmas=sigmas.astype(np.float32),
+        footprints=footprints,
     )
 
 

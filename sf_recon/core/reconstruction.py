@@ -6,48 +6,48 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from sf_interfaces.errors import FormatError
+from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, PointCloud, Scale, UInt8
-from sf_recon.config import ReconConfig
-from sf_recon.core import map_file
+from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, PointCloud, Scale, Trajectory
+from sf_recon.config import MESHES, ReconConfig
+from sf_recon.core import map_file, memory, products
 from sf_recon.core.color_field import ColorField
+from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.neural_points import NeuralPoints
-from sf_recon.core.observation import Observation, auto_resolution, observe, to_map
-from sf_recon.core.rasterizer import make_rasterizer, raster_options
-from sf_recon.core.trainer import Trainer, TrainingView
-
-
-@dataclass(frozen=True, slots=True)
-class RenderedView:
-    """A drawn view. Holes are NaN in depth and black in the image; nothing is painted over."""
-
-    image: UInt8  # [H, W, 3]
-    depth: DepthMap
-
-    @property
-    def hole_fraction(self) -> float:
-        """Fraction of pixels that show no surface."""
-        return 1.0 - self.depth.density
+from sf_recon.core.observation import Observation, auto_resolution, observe, rgb
+from sf_recon.core.rasterizer import make_rasterizer
+from sf_recon.core.renderer import RenderedView, Renderer
+from sf_recon.core.trainer import Trainer
 
 
 class Reconstruction:
-    """A map of neural points that grows with every keyframe."""
+    """A map of neural points that grows with every keyframe.
+
+    Attributes:
+        resolution: spacing of the finest points, m.
+        scale: whether that is metric.
+        poses: T_map_camera of every keyframe so far, by stamp in ns.
+    """
 
     def __init__(self, config: ReconConfig) -> None:
+        make_rasterizer(config)  # a wrong name is an error now, not at the first keyframe
+        if config.mesh not in MESHES:
+            raise ConfigError(f"recon.mesh must be one of {', '.join(MESHES)}, got '{config.mesh}'")
         self.config = config
         self.resolution = config.resolution
         self.scale = Scale.METRIC
-        self._draw = make_rasterizer(config)
+        self.poses: dict[int, Float64] = {}
         self._points: NeuralPoints | None = None
         self._field: ColorField
         self._trainer: Trainer
+        self._renderer: Renderer
         self._rng = np.random.default_rng(config.seed)
         if config.resolution > 0:
             self._start(config.resolution)
@@ -57,51 +57,130 @@ class Reconstruction:
         """Mean squared error of every training iteration so far."""
         return [] if self._points is None else self._trainer.losses
 
+    @property
+    def views(self) -> list[KeyframeView]:
+        """The keyframes that are kept for training and drawing, oldest first."""
+        return [] if self._points is None else self._trainer.views
+
+    @property
+    def points(self) -> NeuralPoints | None:
+        """The neural points; None before the first keyframe."""
+        return self._points
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of points, features, moments, search grids and keyframe images."""
+        if self._points is None:
+            return 0
+        return memory.points_bytes(self._points, self._field, self._trainer) + sum(v.nbytes for v in self.views)
+
     def add(self, keyframe: Keyframe) -> PointCloud:
         """Place points for a keyframe, train its share, and return the added finest points, coloured.
 
         Raises:
             FormatError: no depth, depth of another size, or the first depth image is empty.
         """
-        seen = observe(keyframe, self.config)
-        if self._points is None:
-            assert keyframe.depth is not None
-            self._start(auto_resolution(keyframe.depth, keyframe.camera, self.config.min_resolution))
-        assert self._points is not None and keyframe.depth is not None
-        self.scale = keyframe.depth.scale
-        seen, new = self._merge(keyframe, seen)
-        added = self._points.allocate(seen.points[new], seen.colors[new])
-        self._field.grow(added)
-        self._trainer.add(self._training_view(seen))
+        added = self.place(keyframe)
         self._trainer.run(self.config.iterations)
-        cloud = self._colored(added[0].points)
-        return PointCloud(cloud.points, cloud.colors, stamp_ns=keyframe.stamp_ns, frame_id="map")
+        return self.colored(added, keyframe.stamp_ns)
+
+    def place(self, keyframe: Keyframe) -> Float32:
+        """Place points for a keyframe and take it into training; the added finest points [M, 3] m, map frame.
+
+        Raises:
+            FormatError: no depth, depth of another size, or the first depth image is empty.
+        """
+        seen = observe(keyframe, self.config)
+        assert keyframe.depth is not None
+        if self._points is None:
+            self._start(auto_resolution(keyframe.depth, keyframe.camera, self.config.min_resolution))
+        assert self._points is not None
+        self.scale = keyframe.depth.scale
+        self.poses[keyframe.stamp_ns] = np.array(keyframe.T_map_camera)
+        z, new = self._merge(keyframe, seen)
+        # A uniform error of the depth spreads a surface over some spacings: then a coarser level is fine enough.
+        scales = np.maximum(seen.footprints, seen.sigmas / self.config.merge_gap if self.config.merge_gap else 0)
+        added = self._points.allocate(
+            seen.points[new], seen.colors[new], scales[new], seen.sigmas[new], keyframe.stamp_ns
+        )
+        self._field.grow(added)
+        self._trainer.add(self._view(keyframe, seen, z))
+        if self.config.memory_mb and self.nbytes > 1e6 * self.config.memory_mb:
+            memory.evict(self._points, self._field, self._trainer, self.poses, 1e6 * self.config.memory_mb)
+        return added[0].points
+
+    def learn(self) -> tuple[KeyframeView, float] | None:
+        """One training iteration: the keyframe it trained on and its mean squared error; None without keyframes."""
+        return self._trainer.iterate() if self.views else None
 
     def finish(self) -> None:
         """Train on all keyframes once more, in least-trained-first order."""
         if self._points is not None:
             self._trainer.run(self.config.final_iterations)
 
+    def correct(self, keyframes: Trajectory) -> None:
+        """Move points and training views with the keyframes that placed them, as after a loop closure.
+
+        Args:
+            keyframes: corrected T_map_camera by keyframe stamp; stamps the map does not know are left out.
+        """
+        motion = {}
+        for stamp, T in zip(keyframes.stamps_ns.tolist(), keyframes.poses, strict=True):
+            if stamp in self.poses:
+                motion[stamp] = T @ se3.inverse(self.poses[stamp])
+                self.poses[stamp] = np.array(T)
+        if self._points is None or not motion:
+            return
+        for view in self.views:
+            if view.stamp_ns in motion:
+                view.T_map_camera = self.poses[view.stamp_ns]
+        self._points.move(motion)
+
     def surface(self) -> PointCloud:
-        """The finest points with the colour of the field, map frame."""
+        """The finest points with the colour of the field, map frame; coarse ones where there are no finer."""
         if self._points is None:
             return PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), frame_id="map")
-        return self._colored(self._points.levels[0].points)
+        clouds = [self.colored(self._points.tops(i), level=i) for i in range(len(self._points.levels))]
+        points, colors = (np.concatenate(part) for part in zip(*((c.points, c.colors) for c in clouds), strict=True))
+        return PointCloud(points, colors, frame_id="map")
 
-    def render(self, camera: Camera, T_map_camera: Float64) -> RenderedView:
-        """Draw the surface from a pose: the first layer of points, then the field's colour where rays hit."""
-        image = np.zeros((camera.height * camera.width, 3), np.uint8)
-        z = self._surface_depth(camera, T_map_camera)
-        hit = np.flatnonzero(np.isfinite(z).reshape(-1))
-        if len(hit):
-            image[hit] = _to_uint8(self._field.color(to_map(camera, T_map_camera, z, hit)))
-        return RenderedView(image.reshape(camera.height, camera.width, 3), DepthMap(z, scale=self.scale))
+    def colored(self, points: Float32, stamp_ns: int = 0, level: int = 0) -> PointCloud:
+        """Points [N, 3] m (map frame) of a level with the field's colour from no side."""
+        colors = np.rint(255 * self._field.color(points, level=level)).astype(np.uint8)
+        return PointCloud(points, colors, stamp_ns=stamp_ns, frame_id="map")
+
+    def depth(self, camera: Camera, T_map_camera: Float64) -> Float32:
+        """Depth [H, W] m of the surface seen from a pose, NaN = hole."""
+        if self._points is None:
+            return np.full((camera.height, camera.width), np.nan, np.float32)
+        return self._renderer.depth(camera, T_map_camera)[0]
+
+    def render(self, camera: Camera, T_map_camera: Float64, *, full: bool = False) -> RenderedView:
+        """Draw the surface from a pose; ``full`` adds normals and the variance of the depth."""
+        if self._points is None:
+            z = np.full((camera.height, camera.width), np.nan, np.float32)
+            return RenderedView(np.zeros((*z.shape, 3), np.uint8), DepthMap(z))
+        return self._renderer.render(camera, T_map_camera, self.views, self.scale, full=full)
+
+    def serve(self, host: str, port: int, lock: AbstractContextManager[Any] | None = None) -> Any:
+        """A page that shows the map, see :class:`sf_recon.core.viewer.Viewer`; it reads the map under ``lock``.
+
+        Raises:
+            ConfigError: viser is not installed.
+        """
+        from sf_recon.core.viewer import Viewer
+
+        return Viewer(self, host, port, lock)
 
     def save(self, path: Path) -> None:
-        """Write the map (.sfmap): points, features, network and configuration; no training pixels."""
+        """Write the map (.sfmap): points, features, network, keyframe images and configuration."""
         if self._points is None:
             raise FormatError("the map is empty: add a keyframe before saving it")
-        map_file.write(path, self.config, self.resolution, self.scale, self._points, self._field)
+        map_file.write(path, self.config, self.resolution, self.scale, self.poses, self._points, self._trainer)
+
+    def save_products(self, folder: Path) -> list[Path]:
+        """Write ``map.sfmap``, ``surface.ply`` and, by configuration, ``mesh.ply``; the paths written."""
+        return products.save_products(self, folder)
 
     @staticmethod
     def load(path: Path) -> Reconstruction:
@@ -113,8 +192,8 @@ class Reconstruction:
         saved = map_file.read(path)
         out = Reconstruction(saved.config)
         out._start(saved.resolution)
-        out.scale = saved.scale
-        map_file.restore(saved, out._points, out._field)  # type: ignore[arg-type]
+        out.scale, out.poses = saved.scale, saved.poses
+        map_file.restore(saved, out._points, out._trainer)  # type: ignore[arg-type]
         return out
 
     def _start(self, resolution: float) -> None:
@@ -127,10 +206,11 @@ class Reconstruction:
             hidden=c.hidden,
             neighbours=c.neighbours,
             sigma=c.sigma,
-            colour_base=c.colour_base,
+            view_directions=c.view_directions,
             threads=c.threads,
             generator=torch.Generator().manual_seed(c.seed),
         )
+        self._renderer = Renderer(c, self._points, self._field)
         self._trainer = Trainer(
             self._field,
             pixels=c.pixels,
@@ -140,38 +220,29 @@ class Reconstruction:
             rng=self._rng,
         )
 
-    def _surface_depth(self, camera: Camera, T_map_camera: Float64) -> Float32:
-        if self._points is None:
-            return np.full((camera.height, camera.width), np.nan, np.float32)
-        options = raster_options(self.config, self.resolution)
-        points = self._points.levels[0].points
-        return self._draw(points, camera, se3.inverse(T_map_camera), options).depth
-
-    def _merge(self, keyframe: Keyframe, seen: Observation) -> tuple[Observation, np.ndarray]:
-        """Fuse with the surface drawn so far: (observation, mask [M] of the pixels that show new surface).
+    def _merge(self, keyframe: Keyframe, seen: Observation) -> tuple[Float32, np.ndarray]:
+        """Fuse with the surface drawn so far: (depth [M] m, mask [M] of the pixels that show new surface).
 
         A pixel whose depth agrees with the drawn surface adds no point, and its colour is learnt where the
         ray hits that surface: there the renderer will ask for it.
         """
-        assert self._points is not None
-        if self.config.merge_gap == 0 or len(self._points.levels[0]) == 0:
-            return seen, np.ones(len(seen.points), bool)
         assert keyframe.depth is not None
-        drawn = self._surface_depth(keyframe.camera, keyframe.T_map_camera)
-        gap = np.abs(drawn - keyframe.depth.z).reshape(-1)[seen.pixels]
-        known = gap < self.config.merge_gap * self.resolution
-        points = seen.points.copy()
-        points[known] = to_map(keyframe.camera, keyframe.T_map_camera, drawn, seen.pixels[known])
-        return Observation(seen.pixels, points, seen.colors, seen.weights), ~known
+        z = keyframe.depth.z.reshape(-1)[seen.pixels]
+        if self.config.merge_gap == 0 or not self.views:
+            return z, np.ones(len(z), bool)
+        drawn = self.depth(keyframe.camera, keyframe.T_map_camera).reshape(-1)[seen.pixels]
+        gap = self.config.merge_gap * np.maximum(self.resolution, seen.footprints)
+        with np.errstate(invalid="ignore"):
+            known = np.abs(drawn - z) < np.maximum(gap, seen.sigmas)
+        return np.where(known, drawn, z), ~known
 
-    def _training_view(self, seen: Observation) -> TrainingView:
-        count = min(self.config.keyframe_pixels, len(seen.points))
-        kept = np.sort(self._rng.choice(len(seen.points), count, replace=False)) if count else np.zeros(0, int)
-        return TrainingView(seen.points[kept], _to_uint8(seen.colors[kept]), seen.weights[kept].astype(np.float16))
-
-    def _colored(self, points: Float32) -> PointCloud:
-        return PointCloud(points, _to_uint8(self._field.color(points)), frame_id="map")
-
-
-def _to_uint8(colors: Float32) -> UInt8:
-    return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+    def _view(self, keyframe: Keyframe, seen: Observation, z: Float32) -> KeyframeView:
+        shape = keyframe.image.shape[:2]
+        depth = np.full(shape, np.nan, np.float32)
+        depth.reshape(-1)[seen.pixels] = z
+        weights = None
+        if keyframe.depth is not None and keyframe.depth.variance is not None:
+            weights = np.zeros(shape, np.float32)
+            weights.reshape(-1)[seen.pixels] = seen.weights
+        T, image = keyframe.T_map_camera, rgb(keyframe.image)
+        return KeyframeView.make(keyframe.stamp_ns, keyframe.camera, T, image, depth, weights)

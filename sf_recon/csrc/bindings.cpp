@@ -2,15 +2,20 @@
 // Python module sf_recon._native: arrays in, arrays out. Bad shapes are a TypeError, bad coordinates an IndexError.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
-#include <omp.h>
+#include <nanobind/stl/optional.h>
 
 #include <algorithm>
+#include <cmath>
 #include <memory>
+#include <mutex>
+#include <optional>
+#include <shared_mutex>
 #include <vector>
 
-#include "cell_map.hpp"
+#include "color_decoder.hpp"
 #include "ipr_cpu.hpp"
 #include "point_grid.hpp"
+#include "rows.hpp"
 
 namespace nb = nanobind;
 
@@ -18,6 +23,14 @@ namespace {
 
 using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using MutableRows = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Ids = nb::ndarray<const int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Marks = nb::ndarray<uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Values = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Vector = nb::ndarray<const float, nb::shape<3>, nb::c_contig, nb::device::cpu>;
+using Matrix4 = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using Steps = nb::ndarray<float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Out = nb::ndarray<nb::numpy, T>;
 
@@ -37,97 +50,215 @@ Out<T> give(const std::vector<T>& values, size_t columns = 0) {
 }
 
 nb::tuple knn(const sf::PointGrid& grid, Points queries, int k, float radius, int threads) {
-    if (k < 1 || !(radius > 0)) throw nb::value_error("knn needs k >= 1 and radius > 0");
+    if (k < 1 || k > sf::kMaxNeighbours || !(radius > 0) || !std::isfinite(radius))
+        throw nb::value_error("knn needs 1 <= k <= 64 and a finite radius > 0");
     const size_t n = queries.shape(0);
     std::unique_ptr<int32_t[]> ids(new int32_t[n * k]);
     std::unique_ptr<float[]> distance2(new float[n * k]);
-    bool outside = false;
-    {  // the interpreter lock stays held: another thread must not add points meanwhile
-        const int team = threads > 0 ? threads : omp_get_max_threads();
-#pragma omp parallel for schedule(dynamic, 256) num_threads(team) reduction(|| : outside)
-        for (size_t i = 0; i < n; ++i) {
-            try {
-                grid.query(queries.data() + 3 * i, k, radius, ids.get() + i * k, distance2.get() + i * k);
-            } catch (const std::out_of_range&) {  // an exception must not leave a parallel region
-                outside = true;
-            }
-        }
+    bool inside;
+    {
+        nb::gil_scoped_release release;
+        std::shared_lock<std::shared_mutex> reading(grid.mutex());
+        inside = grid.knn(queries.data(), n, k, radius, ids.get(), distance2.get(), threads);
     }
-    if (outside) throw nb::index_error("a query is not finite or lies too far from the origin");
+    if (!inside) throw nb::index_error("a query is not finite or lies too far from the origin");
     return nb::make_tuple(give(std::move(ids), {n, static_cast<size_t>(k)}),
                           give(std::move(distance2), {n, static_cast<size_t>(k)}));
 }
 
+void add(sf::PointGrid& grid, Points points) {
+    nb::gil_scoped_release release;
+    std::unique_lock<std::shared_mutex> writing(grid.mutex());
+    for (size_t i = 0; i < points.shape(0); ++i) grid.add(points.data() + 3 * i);
+}
+
 nb::tuple add_spaced(sf::PointGrid& grid, Points points, float spacing, float copy_radius) {
     std::vector<int32_t> rows, parents;
-    grid.add_spaced(points.data(), points.shape(0), spacing, copy_radius, rows, parents);
+    {
+        nb::gil_scoped_release release;
+        std::unique_lock<std::shared_mutex> writing(grid.mutex());
+        grid.add_spaced(points.data(), points.shape(0), spacing, copy_radius, rows, parents);
+    }
     return nb::make_tuple(give(rows), give(parents));
 }
 
-// Mean of the rows that fall in each cell of the grid (columns 0-2 are the position), in order of first appearance.
 Out<float> voxel_means(Rows rows, float cell_size) {
-    const size_t n = rows.shape(0), columns = rows.shape(1);
-    if (columns < 3) throw nb::value_error("voxel_means needs at least three columns");
-    sf::CellMap cells;
-    std::vector<double> sums;
-    std::vector<double> counts;
-    for (size_t i = 0; i < n; ++i) {
-        const float* row = rows.data() + i * columns;
-        const size_t cell = cells.insert(sf::cell_of(row, 1.0f / cell_size));
-        if (cell == counts.size()) {
-            counts.push_back(0.0);
-            sums.resize(sums.size() + columns);
-        }
-        counts[cell] += 1.0;
-        for (size_t c = 0; c < columns; ++c) sums[cell * columns + c] += row[c];
-    }
-    std::vector<float> means(sums.size());
-    for (size_t i = 0; i < sums.size(); ++i) means[i] = static_cast<float>(sums[i] / counts[i / columns]);
-    return give(means, columns);
+    if (rows.shape(1) < 3) throw nb::value_error("voxel_means needs at least three columns");
+    return give(sf::voxel_means(rows.data(), rows.shape(0), rows.shape(1), cell_size), rows.shape(1));
 }
 
-// Transpose of the interpolation: sums[ids[i, j]] += weights[i, j] * gradient[i], in order. Returns the rows that were
-// touched, in order of first touch; `marks` (all 0 between calls) tells which.
-Out<int64_t> accumulate_rows(nb::ndarray<const int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu> ids, Rows weights,
-                             Rows gradient, nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu> sums,
-                             nb::ndarray<uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu> marks) {
+Out<float> interpolate(Rows table, Ids ids, Rows weights, int threads) {
+    const size_t n = ids.shape(0), columns = table.shape(1);
+    if (weights.shape(0) != n || weights.shape(1) != ids.shape(1))
+        throw nb::value_error("interpolate: ids and weights differ in shape");
+    std::unique_ptr<float[]> out(new float[n * columns]);
+    bool good;
+    {
+        nb::gil_scoped_release release;
+        good = sf::interpolate(table.data(), table.shape(0), columns, ids.data(), weights.data(), n, ids.shape(1),
+                               out.get(), threads);
+    }
+    if (!good) throw nb::index_error("interpolate: id out of range");
+    return give(std::move(out), {n, columns});
+}
+
+std::vector<int64_t> accumulate(Ids ids, Rows weights, Rows gradient, MutableRows sums, Marks marks) {
     const size_t n = ids.shape(0), k = ids.shape(1), columns = gradient.shape(1), rows = sums.shape(0);
     if (weights.shape(0) != n || weights.shape(1) != k || gradient.shape(0) != n || sums.shape(1) != columns ||
         marks.shape(0) != rows)
         throw nb::value_error("accumulate_rows: shapes do not agree");
     std::vector<int64_t> touched;
-    for (size_t i = 0; i < n * k; ++i) {
-        const float weight = weights.data()[i];
-        if (weight == 0.0f) continue;  // no neighbour there
-        const size_t row = static_cast<size_t>(ids.data()[i]);
-        if (row >= rows) throw nb::index_error("accumulate_rows: id out of range");
-        if (!marks.data()[row]) touched.push_back(static_cast<int64_t>(row));
-        marks.data()[row] = 1;
-        float* sum = sums.data() + row * columns;
-        const float* g = gradient.data() + i / k * columns;
-        for (size_t c = 0; c < columns; ++c) sum[c] += weight * g[c];
-    }
-    for (const int64_t row : touched) marks.data()[row] = 0;
-    return give(touched);
+    if (!sf::accumulate_rows(ids.data(), weights.data(), n, k, gradient.data(), columns, sums.data(), marks.data(),
+                             rows, touched))
+        throw nb::index_error("accumulate_rows: id out of range");
+    return touched;
 }
 
-nb::tuple rasterize(Points points, nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig> T_camera_map, float fx,
-                    float fy, float cx, float cy, int width, int height, float radius, float near, float max_half,
-                    int k_ray, float layer_gap, float sigma, int threads) {
+Out<int64_t> accumulate_rows(Ids ids, Rows weights, Rows gradient, MutableRows sums, Marks marks) {
+    return give(accumulate(ids, weights, gradient, sums, marks));
+}
+
+void adam_rows(Ids ids, Rows weights, Rows gradient, MutableRows table, MutableRows mean, MutableRows square,
+               Steps steps, MutableRows sums, Marks marks, float rate, float beta1, float beta2, float epsilon) {
+    for (const MutableRows& other : {table, mean, square})
+        if (other.shape(0) != sums.shape(0) || other.shape(1) != sums.shape(1))
+            throw nb::value_error("adam_rows: table, moments and sums differ in shape");
+    if (steps.shape(0) != sums.shape(0)) throw nb::value_error("adam_rows: steps and sums differ in length");
+    const std::vector<int64_t> touched = accumulate(ids, weights, gradient, sums, marks);
+    sf::adam_rows(touched, sums.shape(1), {rate, beta1, beta2, epsilon}, sums.data(), table.data(), mean.data(),
+                  square.data(), steps.data());
+}
+
+// A network of Python arrays, checked and kept alive.
+struct Network {
+    sf::ColorNetwork net{};
+    std::vector<Rows> tables;
+    std::vector<Values> biases;
+    size_t width = 0;  // of the network's input
+
+    Network(nb::list levels, nb::list layers, int neighbours, std::optional<Rows> base, int degree) {
+        if (neighbours < 1 || neighbours > 16) throw nb::value_error("decoding needs 1 to 16 neighbours");
+        if (degree < 0 || degree > 2) throw nb::value_error("the degree of the viewing direction is 0, 1 or 2");
+        if (levels.size() == 0 || layers.size() == 0) throw nb::value_error("decoding needs levels and layers");
+        net.neighbours = neighbours, net.degree = degree, width = sf::direction_columns(degree);
+        for (nb::handle item : levels) add_level(nb::cast<nb::tuple>(item));
+        for (nb::handle item : layers) add_layer(nb::cast<nb::tuple>(item));
+        if (!base) return;
+        if (base->shape(1) != 3) throw nb::value_error("base colours have three columns");
+        net.base = tables.emplace_back(*base).data(), net.base_rows = base->shape(0);
+    }
+
+    void add_level(const nb::tuple& level) {
+        if (level.size() != 4) throw nb::value_error("a level is (grid, features, radius, sigma)");
+        const Rows& features = tables.emplace_back(nb::cast<Rows>(level[1]));
+        const float radius = nb::cast<float>(level[2]), sigma = nb::cast<float>(level[3]);
+        if (!(radius > 0) || !std::isfinite(radius) || !(sigma > 0))
+            throw nb::value_error("a level needs a finite radius > 0 and sigma > 0");
+        net.levels.push_back({nb::cast<const sf::PointGrid*>(level[0]), features.data(), features.shape(0),
+                              features.shape(1), radius, 1 / sigma});
+        width += features.shape(1);
+    }
+
+    void add_layer(const nb::tuple& layer) {
+        if (layer.size() != 2) throw nb::value_error("a layer is (weight, bias)");
+        const Rows& weight = tables.emplace_back(nb::cast<Rows>(layer[0]));
+        const Values& bias = biases.emplace_back(nb::cast<Values>(layer[1]));
+        if (bias.shape(0) != weight.shape(0)) throw nb::value_error("a layer's weight and bias differ in length");
+        net.layers.push_back({weight.data(), bias.data(), weight.shape(1), weight.shape(0)});
+    }
+
+    void add_extra(const Rows& extra, size_t queries) {
+        if (extra.shape(0) != queries) throw nb::value_error("extra inputs: one row for each query");
+        net.extra = tables.emplace_back(extra).data(), net.extra_columns = extra.shape(1);
+        width += extra.shape(1);
+    }
+
+    // Runs decode(net) -> good without the interpreter lock while nobody may add points.
+    template <class Decode>
+    void run(const Decode& decode) {
+        size_t inputs = width;
+        for (const sf::Layer& layer : net.layers) {
+            if (layer.inputs != inputs) throw nb::value_error("the layers do not fit the features or one another");
+            inputs = layer.outputs;
+        }
+        if (inputs != 3) throw nb::value_error("the last layer must have three outputs");
+        bool good;
+        {
+            nb::gil_scoped_release release;
+            std::vector<std::shared_lock<std::shared_mutex>> reading;
+            for (const sf::FieldLevel& level : net.levels) reading.emplace_back(level.grid->mutex());
+            good = decode(net);
+        }
+        if (!good) throw nb::index_error("a query is not finite or lies too far from the origin");
+    }
+};
+
+Out<float> decode_colors(Points queries, nb::list levels, nb::list layers, int neighbours, std::optional<Vector> eye,
+                         int degree, std::optional<Rows> base, std::optional<Rows> extra, int threads) {
+    if (degree > 0 && !eye) throw nb::value_error("a viewing direction needs the eye");
+    Network network(levels, layers, neighbours, base, degree);
+    const size_t n = queries.shape(0);
+    if (extra) network.add_extra(*extra, n);
+    std::unique_ptr<float[]> colors(new float[3 * n]);
+    network.run([&](const sf::ColorNetwork& net) {
+        return sf::decode_colors(net, queries.data(), n, eye ? eye->data() : nullptr, colors.get(), threads);
+    });
+    return give(std::move(colors), {n, 3});
+}
+
+Out<float> decode_image(Image positions, Matrix4 T_map_camera, nb::list levels, nb::list layers, int neighbours,
+                        int degree, std::optional<Rows> base, int threads) {
+    Network network(levels, layers, neighbours, base, degree);
+    const size_t h = positions.shape(0), w = positions.shape(1);
+    std::unique_ptr<float[]> colors(new float[3 * h * w]);
+    network.run([&](const sf::ColorNetwork& net) {
+        return sf::decode_image(net, positions.data(), h, w, T_map_camera.data(), colors.get(), threads);
+    });
+    return give(std::move(colors), {h, w, 3});
+}
+
+// An image to be filled when it is wanted, else nothing.
+template <class T>
+struct Wanted {
+    std::unique_ptr<T[]> data;
+    std::vector<size_t> shape;
+
+    Wanted(bool wanted, std::vector<size_t> shape_) : shape(std::move(shape_)) {
+        size_t size = 1;
+        for (const size_t extent : shape) size *= extent;
+        if (wanted) data.reset(new T[size]);
+    }
+
+    nb::object array() {
+        if (!data) return nb::none();
+        T* raw = data.release();
+        nb::capsule owner(raw, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+        return nb::cast(Out<T>(raw, shape.size(), shape.data(), owner));
+    }
+};
+
+nb::tuple rasterize(Points points, Matrix4 T_camera_map, float fx, float fy, float cx, float cy, int width, int height,
+                    float radius, float near, float max_half, int k_ray, float layer_gap, float sigma,
+                    std::optional<Points> normals, bool position, bool index, bool weight, bool normal, int threads) {
     if (width < 1 || height < 1 || k_ray < 1 || !(near > 0) || !(sigma > 0) || !(max_half >= 0.5f))
         throw nb::value_error("rasterize needs a non-empty image, k_ray >= 1, near > 0, sigma > 0, max_half >= 0.5");
+    if (width > 32768 || height > 32768 || k_ray > 1024 || max_half > 32768 || points.shape(0) > 2000000000)
+        throw nb::value_error("rasterize: at most 32768 pixels a side, k_ray 1024, 2e9 points");
+    if (normals && normals->shape(0) != points.shape(0)) throw nb::value_error("one normal for each point");
     sf::RasterSpec spec{{}, {}, fx, fy, cx, cy, width, height, radius, near, max_half, k_ray, layer_gap, sigma, threads};
     for (int i = 0; i < 3; ++i) {
         for (int j = 0; j < 3; ++j) spec.rotation[3 * i + j] = T_camera_map(i, j);
         spec.translation[i] = T_camera_map(i, 3);
     }
-    const size_t w = width, h = height;
-    std::unique_ptr<float[]> depth(new float[w * h]), position(new float[w * h * 3]);
+    const size_t w = width, h = height, k = k_ray;
+    Wanted<float> z(true, {h, w}), xyz(position, {h, w, 3}), weights(weight, {h, w, k}), n(normal, {h, w, 3});
+    Wanted<int32_t> ids(index, {h, w, k});
     {
         nb::gil_scoped_release release;
-        sf::rasterize(points.data(), points.shape(0), spec, depth.get(), position.get());
+        sf::rasterize(points.data(), normals ? normals->data() : nullptr, points.shape(0), spec,
+                      {z.data.get(), xyz.data.get(), ids.data.get(), weights.data.get(), n.data.get()});
     }
-    return nb::make_tuple(give(std::move(depth), {h, w}), give(std::move(position), {h, w, 3}));
+    return nb::make_tuple(z.array(), xyz.array(), ids.array(), weights.array(), n.array());
 }
 
 }  // namespace
@@ -138,17 +269,25 @@ NB_MODULE(_native, m) {
         .def(nb::init<float>(), nb::arg("cell_size"))
         .def("__len__", &sf::PointGrid::size)
         .def("add_spaced", &add_spaced, nb::arg("points"), nb::arg("spacing"), nb::arg("copy_radius"))
-        .def(
-            "add",
-            [](sf::PointGrid& grid, Points points) {
-                for (size_t i = 0; i < points.shape(0); ++i) grid.add(points.data() + 3 * i);
-            },
-            nb::arg("points"))
+        .def("add", &add, nb::arg("points"))
         .def("knn", &knn, nb::arg("queries"), nb::arg("k"), nb::arg("radius"), nb::arg("threads") = 0);
     m.def("voxel_means", &voxel_means, nb::arg("rows"), nb::arg("cell_size"));
     m.def("accumulate_rows", &accumulate_rows, nb::arg("ids"), nb::arg("weights"), nb::arg("gradient"),
           nb::arg("sums").noconvert(), nb::arg("marks").noconvert());
+    m.def("interpolate", &interpolate, nb::arg("table"), nb::arg("ids"), nb::arg("weights"), nb::arg("threads") = 0);
+    m.def("adam_rows", &adam_rows, nb::arg("ids"), nb::arg("weights"), nb::arg("gradient"),
+          nb::arg("table").noconvert(), nb::arg("mean").noconvert(), nb::arg("square").noconvert(),
+          nb::arg("steps").noconvert(), nb::arg("sums").noconvert(), nb::arg("marks").noconvert(), nb::arg("rate"),
+          nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"));
+    m.def("decode_colors", &decode_colors, nb::arg("queries"), nb::arg("levels"), nb::arg("layers"),
+          nb::arg("neighbours"), nb::arg("eye") = nb::none(), nb::arg("degree") = 0, nb::arg("base") = nb::none(),
+          nb::arg("extra") = nb::none(), nb::arg("threads") = 0);
+    m.def("decode_image", &decode_image, nb::arg("positions"), nb::arg("T_map_camera"), nb::arg("levels"),
+          nb::arg("layers"), nb::arg("neighbours"), nb::arg("degree") = 0, nb::arg("base") = nb::none(),
+          nb::arg("threads") = 0);
     m.def("rasterize", &rasterize, nb::arg("points"), nb::arg("T_camera_map"), nb::arg("fx"), nb::arg("fy"),
           nb::arg("cx"), nb::arg("cy"), nb::arg("width"), nb::arg("height"), nb::arg("radius"), nb::arg("near"),
-          nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"), nb::arg("threads") = 0);
+          nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"),
+          nb::arg("normals") = nb::none(), nb::arg("position") = true, nb::arg("index") = false,
+          nb::arg("weight") = false, nb::arg("normal") = false, nb::arg("threads") = 0);
 }

@@ -1,187 +1,281 @@
 // SPDX-License-Identifier: Apache-2.0
-// Points are culled, binned into square tiles by a counting sort whose order does not depend on the number of threads,
-// and each tile is drawn front to back, so that K nearest, first layer and weighted mean need no per-pixel list.
+// Second half of the rasteriser: each tile is drawn front to back into short lists of its pixels, until all are full.
 #include "ipr_cpu.hpp"
 
 #include <omp.h>
 
-#include <algorithm>
 #include <cmath>
-#include <cstdint>
-#include <cstring>
-#include <limits>
-#include <memory>
-#include <vector>
+
+#include "ipr_bins.hpp"
 
 namespace sf {
 namespace {
 
-constexpr int kTile = 16;    // px
-constexpr int kChunks = 64;  // fixed: the order of fragments must not follow the number of threads
+constexpr int kPixels = kTile * kTile, kBuckets = 256;
+constexpr float kInfinity = std::numeric_limits<float>::infinity();
+constexpr int32_t kClosed = static_cast<int32_t>(0xff800000u);  // bits of -inf
+constexpr float kHole = std::numeric_limits<float>::quiet_NaN();
 
-struct Fragment {  // a visible point: continuous pixel, depth
-    float u, v, z;
+constexpr float kMinStep = 1e-5f;  // of the depth; pixels that show the same point differ by rounding only
+constexpr float kMinSine = 1e-2f;  // of the angle between two differences that span a surface
+
+inline float norm_of(const float* v) { return std::sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]); }
+
+struct Item {  // a fragment to be sorted
+    uint64_t key;     // bits of the depth (positive floats sort like their bits) above the row in the cloud
+    uint32_t window;  // x0 | x1 << 8 | y0 << 16 | y1 << 24, pixels of the tile
+    uint32_t local;   // number among the fragments of the tile
+
+    bool operator<(const Item& o) const { return key < o.key; }
+    float z() const { return from_bits(static_cast<int32_t>(key >> 32)); }
 };
 
-struct Window {  // covered pixels, inclusive, inside the image; empty when x1 < x0 or y1 < y0
-    int x0, x1, y0, y1;
+struct TileScratch {
+    std::vector<uint32_t> windows;
+    std::vector<float> splats;  // [fragments, 4] u, v, z, -1 / (sigma * half-width^2) along x
+    std::vector<Item> items;
+    std::vector<uint32_t> list;  // [k_ray + 1, pixels] local numbers, front to back; the last row takes what is too much
+    std::vector<float> weight;   // [k_ray, kTile] of one row of pixels
+    int32_t count[kPixels];
+    int32_t last_z[kPixels];  // bits of the last point's depth; inf before the first, -inf once the layer is closed
+
+    void reserve(size_t n) {
+        if (windows.size() >= n) return;
+        windows.resize(n), items.resize(n);
+        splats.resize(4 * n);
+    }
 };
 
-inline float half_width(const RasterSpec& s, float focal, float z) {
-    return std::min(std::max(s.radius * focal / z, 0.5f), s.max_half);
+SF_INLINE void unpack(const RasterSpec& spec, const Fragment* fragments, size_t n, int left, int top, TileScratch& t) {
+    const RasterSpec s = spec;
+    const int right = std::min(left + kTile, s.width) - 1, bottom = std::min(top + kTile, s.height) - 1;
+    uint32_t* windows = t.windows.data();
+    float* splats = t.splats.data();
+#pragma GCC ivdep
+    for (size_t i = 0; i < n; ++i) {
+        const float u = fragments[i].u, v = fragments[i].v, z = fragments[i].z;
+        const float hx = half_width(s, s.fx, z), hy = half_width(s, s.fy, z);
+        splats[4 * i] = u, splats[4 * i + 1] = v, splats[4 * i + 2] = z;
+        splats[4 * i + 3] = -1.0f / (s.sigma * hx * hx);
+        const int x0 = first_pixel(u, hx, left) - left, x1 = last_pixel(u, hx, right) - left;
+        const int y0 = first_pixel(v, hy, top) - top, y1 = last_pixel(v, hy, bottom) - top;
+        windows[i] = static_cast<uint32_t>(x0 | x1 << 8 | y0 << 16 | y1 << 24);
+    }
 }
 
-inline Window window_of(const RasterSpec& s, const Fragment& f) {
-    const float hx = half_width(s, s.fx, f.z), hy = half_width(s, s.fy, f.z);
-    Window w;
-    w.x0 = std::max(0, static_cast<int>(std::ceil(f.u - hx - 0.5f)));
-    w.x1 = std::min(s.width - 1, static_cast<int>(std::floor(f.u + hx - 0.5f)));
-    w.y0 = std::max(0, static_cast<int>(std::ceil(f.v - hy - 0.5f)));
-    w.y1 = std::min(s.height - 1, static_cast<int>(std::floor(f.v + hy - 0.5f)));
-    return w;
+// Groups the fragments by depth into buckets begin[b]..begin[b + 1], nearest first; each is sorted only when needed.
+// Returns how many buckets there are.
+SF_INLINE int bucket_by_depth(const Fragment* fragments, size_t n, TileScratch& t, uint32_t* begin) {
+    const int buckets = n < 48 ? 16 : n < 192 ? 64 : kBuckets;
+    int32_t low = to_bits(fragments[0].z), high = low;
+    for (size_t i = 0; i < n; ++i) {
+        const int32_t bits = to_bits(fragments[i].z);
+        low = bits < low ? bits : low;
+        high = bits > high ? bits : high;
+    }
+    int shift = 0;
+    while ((high - low) >> shift >= buckets) ++shift;
+    std::fill(begin, begin + buckets + 2, 0u);
+    for (size_t i = 0; i < n; ++i) ++begin[((to_bits(fragments[i].z) - low) >> shift) + 2];
+    for (int b = 2; b < buckets + 2; ++b) begin[b] += begin[b - 1];
+    for (size_t i = 0; i < n; ++i) {
+        const uint64_t bits = static_cast<uint64_t>(to_bits(fragments[i].z));
+        t.items[begin[((static_cast<int32_t>(bits) - low) >> shift) + 1]++] = {
+            bits << 32 | static_cast<uint32_t>(fragments[i].id), t.windows[i], static_cast<uint32_t>(i)};
+    }
+    return buckets;
 }
 
-// Camera coordinates and projection; false for a point that touches no pixel.
-inline bool project(const RasterSpec& s, const float* p, Fragment& f) {
+// One fragment into the lists of the pixels it covers; returns how many of them it closes. Free of branches.
+SF_INLINE int draw(const Item& item, int k, float gap, TileScratch& t) {
+    const int x0 = item.window & 255, x1 = item.window >> 8 & 255;
+    const int y0 = item.window >> 16 & 255, y1 = item.window >> 24;
+    const float z = item.z();
+    const int32_t bits = to_bits(z);
+    int closed = 0;
+    for (int j = y0; j <= y1; ++j)
+        for (int p = j * kTile + x0; p <= j * kTile + x1; ++p) {
+            const int32_t last = t.last_z[p], count = t.count[p];
+            const int32_t taken = z - from_bits(last) < gap;
+            const int32_t open = taken & (count + 1 < k), mask = -open;
+            t.list[static_cast<size_t>(count * kPixels + p)] = item.local;
+            t.count[p] = count + taken;
+            t.last_z[p] = (bits & mask) | (kClosed & ~mask);
+            closed += (last != kClosed) & ~open;
+        }
+    return closed;
+}
+
+void insertion_sort(Item* first, Item* last) {
+    for (Item* i = first + 1; i < last; ++i) {
+        const Item item = *i;
+        Item* j = i;
+        for (; j > first && item < j[-1]; --j) *j = j[-1];
+        *j = item;
+    }
+}
+
+SF_SIMD void fill_lists(const RasterSpec& s, const Fragment* fragments, size_t n, int left, int top, TileScratch& t) {
+    std::fill(t.count, t.count + kPixels, 0);
+    std::fill(t.last_z, t.last_z + kPixels, to_bits(kInfinity));
+    if (n == 0) return;
+    t.reserve(n);
+    unpack(s, fragments, n, left, top, t);
+    uint32_t begin[kBuckets + 2];
+    const int buckets = bucket_by_depth(fragments, n, t, begin);
+    int open = std::min(kTile, s.width - left) * std::min(kTile, s.height - top);
+    for (int b = 0; b < buckets && open > 0; ++b) {
+        Item *first = t.items.data() + begin[b], *last = t.items.data() + begin[b + 1];
+        if (last - first > 24)
+            std::sort(first, last);
+        else if (last - first > 1)
+            insertion_sort(first, last);
+        for (; first < last && open > 0; ++first) open -= draw(*first, s.k_ray, s.layer_gap, t);
+    }
+}
+
+struct RowMeans {  // over the first layer of one row of pixels; `weight` is what turns a weight into its share
+    float weight[kTile], x[kTile], y[kTile], z[kTile];
+};
+
+// Weighted means of the first layer for eight pixels of a row; `t.weight` keeps the weights before normalisation.
+SF_INLINE void resolve8(const RasterSpec& s, float u, float v, int pixel, TileScratch& t, RowMeans& out) {
+    const Int8 count = *reinterpret_cast<const Int8*>(t.count + pixel);
+    const Float8 centre = Float8{0, 1, 2, 3, 4, 5, 6, 7} + u;
+    const bool square = s.fx == s.fy;
+    const int most = *std::max_element(t.count + pixel, t.count + pixel + 8), column = pixel % kTile;
+    Float8 sum_w{}, sum_x{}, sum_y{}, sum_z{};
+    for (int c = 0; c < most; ++c) {
+        const Int8 used = count > c;
+        const Int8 rows = 4 * *reinterpret_cast<const Int8*>(t.list.data() + c * kPixels + pixel) & used;
+        Float8 splat[4];  // u, v, z, -1 / (sigma * half-width^2)
+        gather8x4(t.splats.data(), rows, splat);
+        const Float8 z = splat[2];
+        Float8 per_y2 = splat[3];
+        if (!square) {
+            Float8 half = s.radius * s.fy / z;
+            half = half > 0.5f ? half : Float8{} + 0.5f;
+            half = half < s.max_half ? half : Float8{} + s.max_half;
+            per_y2 = -1.0f / (s.sigma * half * half);
+        }
+        const Float8 dx = centre - splat[0], dy = v - splat[1];
+        const Float8 gauss = exp_negative(dx * dx * splat[3] + dy * dy * per_y2);
+        const Float8 w = used ? gauss : Float8{};
+        std::memcpy(t.weight.data() + c * kTile + column, &w, sizeof(w));
+        const Float8 wz = w * z;
+        sum_w += w;
+        sum_z += wz;
+        sum_x += wz * (splat[0] - s.cx);
+        sum_y += wz * (splat[1] - s.cy);
+    }
+    const Float8 scale = count > 0 ? 1.0f / sum_w : Float8{} + kHole;
+    const Float8 means[4] = {sum_x * scale / s.fx, sum_y * scale / s.fy, sum_z * scale, scale};
+    std::memcpy(out.x + column, &means[0], 32), std::memcpy(out.y + column, &means[1], 32);
+    std::memcpy(out.z + column, &means[2], 32), std::memcpy(out.weight + column, &means[3], 32);
+}
+
+SF_SIMD void resolve_row(const RasterSpec& spec, int left, int row, int v, TileScratch& t, RowMeans& out) {
+    const RasterSpec s = spec;
+    for (int i = 0; i < kTile; i += 8)
+        resolve8(s, static_cast<float>(left + i) + 0.5f, static_cast<float>(v) + 0.5f, row * kTile + i, t, out);
+}
+
+// Mean of the points' normals, each turned towards the camera.
+void blend_normals(const RasterSpec& s, const float* normals, const Fragment* fragments, const TileScratch& t,
+                   int pixel, const float* position, float* out) {
     const float* R = s.rotation;
-    f.z = R[6] * p[0] + R[7] * p[1] + R[8] * p[2] + s.translation[2];
-    if (!(f.z >= s.near && f.z < std::numeric_limits<float>::infinity())) return false;
-    f.u = s.fx * (R[0] * p[0] + R[1] * p[1] + R[2] * p[2] + s.translation[0]) / f.z + s.cx;
-    f.v = s.fy * (R[3] * p[0] + R[4] * p[1] + R[5] * p[2] + s.translation[1]) / f.z + s.cy;
-    const float mx = s.max_half + 1.0f;  // reject before any conversion to int can overflow
-    return f.u > -mx && f.u < s.width + mx && f.v > -mx && f.v < s.height + mx;
+    float sum[3] = {0.0f, 0.0f, 0.0f}, total = 0.0f;
+    for (int c = 0; c < t.count[pixel]; ++c) {
+        const float* n = normals + 3 * static_cast<size_t>(fragments[t.list[c * kPixels + pixel]].id);
+        const float weight = t.weight[c * kTile + pixel % kTile];
+        total += weight;
+        float m[3];
+        for (int a = 0; a < 3; ++a) m[a] = R[3 * a] * n[0] + R[3 * a + 1] * n[1] + R[3 * a + 2] * n[2];
+        const float towards = m[0] * position[0] + m[1] * position[1] + m[2] * position[2] > 0.0f ? -1.0f : 1.0f;
+        for (int a = 0; a < 3; ++a) sum[a] += towards * weight * m[a];
+    }
+    const float norm = norm_of(sum);
+    for (int a = 0; a < 3; ++a) out[a] = norm > 1e-6f * total && total > 0.0f ? sum[a] / norm : kHole;
 }
 
-struct Bins {
-    std::unique_ptr<Fragment[]> fragments;  // grouped by tile, in point order within a tile
-    std::vector<size_t> begin;              // [tiles + 1]
-};
-
-template <class Visit>
-inline void for_tiles(const Window& w, int tiles_x, Visit visit) {
-    for (int ty = w.y0 / kTile; ty <= w.y1 / kTile; ++ty)
-        for (int tx = w.x0 / kTile; tx <= w.x1 / kTile; ++tx) visit(ty * tiles_x + tx);
-}
-
-Bins bin_points(const float* points, size_t n, const RasterSpec& s, int tiles_x, int tiles, int threads) {
-    std::unique_ptr<Fragment[]> visible(new Fragment[n]);
-    std::vector<size_t> found(kChunks);
-    std::vector<size_t> offset(static_cast<size_t>(kChunks) * tiles);  // counts first, then write positions
-    const auto first = [&](int chunk) { return n * chunk / kChunks; };
-#pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
-    for (int c = 0; c < kChunks; ++c) {
-        Fragment* out = visible.get() + first(c);
-        for (size_t i = first(c); i < first(c + 1); ++i) {
-            if (!project(s, points + 3 * i, *out)) continue;
-            const Window w = window_of(s, *out);
-            if (w.x1 < w.x0 || w.y1 < w.y0) continue;
-            for_tiles(w, tiles_x, [&](int tile) { ++offset[static_cast<size_t>(c) * tiles + tile]; });
-            ++out;
-        }
-        found[c] = out - (visible.get() + first(c));
+void write_row(const RasterSpec& s, const float* normals, const Fragment* fragments, int row, size_t at, int width,
+               const TileScratch& t, const RowMeans& means, const RasterImages& out) {
+    std::copy(means.z, means.z + width, out.depth + at);
+    for (int i = 0; i < width && out.position; ++i) {
+        float* p = out.position + 3 * (at + i);
+        p[0] = means.x[i], p[1] = means.y[i], p[2] = means.z[i];
     }
-    Bins bins;
-    bins.begin.resize(tiles + 1);
-    size_t total = 0;
-    for (int tile = 0; tile < tiles; ++tile) {
-        bins.begin[tile] = total;
-        for (int c = 0; c < kChunks; ++c) {
-            size_t& slot = offset[static_cast<size_t>(c) * tiles + tile];
-            const size_t count = slot;
-            slot = total;
-            total += count;
-        }
+    const size_t k = s.k_ray;
+    for (int i = 0; i < width && (out.index || out.weight); ++i) {
+        const size_t count = t.count[row * kTile + i];
+        const uint32_t* list = t.list.data() + row * kTile + i;
+        for (size_t c = 0; c < k && out.index; ++c)
+            out.index[(at + i) * k + c] = c < count ? fragments[list[c * kPixels]].id : -1;
+        for (size_t c = 0; c < k && out.weight; ++c)
+            out.weight[(at + i) * k + c] = c < count ? t.weight[c * kTile + i] * means.weight[i] : 0.0f;
     }
-    bins.begin[tiles] = total;
-    bins.fragments.reset(new Fragment[total]);
-#pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
-    for (int c = 0; c < kChunks; ++c) {
-        size_t* write = offset.data() + static_cast<size_t>(c) * tiles;
-        for (size_t i = 0; i < found[c]; ++i) {
-            const Fragment& f = visible[first(c) + i];
-            for_tiles(window_of(s, f), tiles_x, [&](int tile) { bins.fragments[write[tile]++] = f; });
-        }
-    }
-    return bins;
-}
-
-struct Pixel {  // running sums over the first layer
-    float last_z, weight, z, x, y;
-    int count;  // k_ray once the layer is closed
-};
-
-// One fragment into the pixels of its window that lie in the tile at (left, top).
-inline void draw(const RasterSpec& s, const Fragment& f, int left, int top, Pixel* pixels) {
-    const Window w = window_of(s, f);
-    const float hx = half_width(s, s.fx, f.z), hy = half_width(s, s.fy, f.z);
-    const float x = (f.u - s.cx) / s.fx * f.z, y = (f.v - s.cy) / s.fy * f.z;
-    const int x0 = std::max(w.x0, left), x1 = std::min(w.x1, left + kTile - 1);
-    const int y0 = std::max(w.y0, top), y1 = std::min(w.y1, top + kTile - 1);
-    float column[kTile];  // the Gaussian is separable: one exp per column and row, not per pixel
-    for (int i = x0; i <= x1; ++i) {
-        const float q = (i + 0.5f - f.u) / hx;
-        column[i - left] = std::exp(-q * q / s.sigma);
-    }
-    for (int j = y0; j <= y1; ++j) {
-        const float q = (j + 0.5f - f.v) / hy;
-        const float row = std::exp(-q * q / s.sigma);
-        for (int i = x0; i <= x1; ++i) {
-            Pixel& pixel = pixels[(j - top) * kTile + i - left];
-            if (pixel.count == s.k_ray) continue;
-            if (pixel.count > 0 && f.z - pixel.last_z >= s.layer_gap) {
-                pixel.count = s.k_ray;
-                continue;
-            }
-            const float weight = row * column[i - left];
-            pixel.last_z = f.z;
-            pixel.weight += weight;
-            pixel.z += weight * f.z;
-            pixel.x += weight * x;
-            pixel.y += weight * y;
-            ++pixel.count;
-        }
+    for (int i = 0; i < width && out.normal && normals; ++i) {
+        const float position[3] = {means.x[i], means.y[i], means.z[i]};
+        blend_normals(s, normals, fragments, t, row * kTile + i, position, out.normal + 3 * (at + i));
     }
 }
 
-void draw_tile(const RasterSpec& s, const Fragment* fragments, size_t n, int left, int top,
-               std::vector<uint64_t>& order, float* depth, float* position) {
-    order.resize(n);
-    for (size_t i = 0; i < n; ++i) {  // bits of a positive float sort like the float; the index breaks ties
-        uint32_t bits;
-        std::memcpy(&bits, &fragments[i].z, 4);
-        order[i] = static_cast<uint64_t>(bits) << 32 | i;
+void draw_tile(const RasterSpec& s, const float* normals, const Bins& bins, int tile, TileScratch& t,
+               const RasterImages& out) {
+    const int left = tile % bins.tiles_x * kTile, top = tile / bins.tiles_x * kTile;
+    const Fragment* fragments = bins.fragments.get() + bins.begin[tile];
+    fill_lists(s, fragments, bins.begin[tile + 1] - bins.begin[tile], left, top, t);
+    for (int v = top; v < std::min(top + kTile, s.height); ++v) {
+        RowMeans sums;
+        resolve_row(s, left, v - top, v, t, sums);
+        write_row(s, normals, fragments, v - top, static_cast<size_t>(v) * s.width + left,
+                  std::min(kTile, s.width - left), t, sums, out);
     }
-    std::sort(order.begin(), order.end());
-    Pixel pixels[kTile * kTile] = {};
-    for (const uint64_t key : order) draw(s, fragments[key & 0xffffffffu], left, top, pixels);
-    const float hole = std::numeric_limits<float>::quiet_NaN();
-    for (int j = top; j < std::min(top + kTile, s.height); ++j)
-        for (int i = left; i < std::min(left + kTile, s.width); ++i) {
-            const Pixel& p = pixels[(j - top) * kTile + i - left];
-            const size_t at = static_cast<size_t>(j) * s.width + i;
-            const bool hit = p.weight > 0.0f;
-            depth[at] = hit ? p.z / p.weight : hole;
-            if (position == nullptr) continue;
-            position[3 * at] = hit ? p.x / p.weight : hole;
-            position[3 * at + 1] = hit ? p.y / p.weight : hole;
-            position[3 * at + 2] = depth[at];
-        }
 }
 
 }  // namespace
 
-void rasterize(const float* points, size_t n, const RasterSpec& s, float* depth, float* position) {
+void rasterize(const float* points, const float* normals, size_t n, const RasterSpec& s, const RasterImages& wanted) {
     const int threads = s.threads > 0 ? s.threads : omp_get_max_threads();
-    const int tiles_x = (s.width + kTile - 1) / kTile, tiles_y = (s.height + kTile - 1) / kTile;
-    const Bins bins = bin_points(points, n, s, tiles_x, tiles_x * tiles_y, threads);
+    thread_local Binner binner;  // a render loop does not pay for fresh memory in every frame
+    const Bins& bins = binner.bin(points, n, s, threads);
+    RasterImages out = wanted;
+    std::unique_ptr<float[]> position;
+    if (out.normal && !normals && !out.position) {
+        position.reset(new float[3 * static_cast<size_t>(s.width) * s.height]);
+        out.position = position.get();
+    }
 #pragma omp parallel num_threads(threads)
     {
-        std::vector<uint64_t> order;
+        TileScratch scratch;
+        scratch.list.resize(static_cast<size_t>(s.k_ray + 1) * kPixels);
+        scratch.weight.resize(static_cast<size_t>(s.k_ray) * kTile);
 #pragma omp for schedule(dynamic, 8)
-        for (int tile = 0; tile < tiles_x * tiles_y; ++tile)
-            draw_tile(s, bins.fragments.get() + bins.begin[tile], bins.begin[tile + 1] - bins.begin[tile],
-                      tile % tiles_x * kTile, tile / tiles_x * kTile, order, depth, position);
+        for (int tile = 0; tile < bins.tiles_x * bins.tiles_y; ++tile) draw_tile(s, normals, bins, tile, scratch, out);
     }
+    if (out.normal && !normals) normals_of(out.position, s.width, s.height, s.layer_gap, threads, out.normal);
+}
+
+void normals_of(const float* position, int width, int height, float layer_gap, int threads, float* normal) {
+    const auto at = [&](int u, int v) { return position + 3 * (static_cast<size_t>(v) * width + u); };
+#pragma omp parallel for num_threads(threads)
+    for (int v = 0; v < height; ++v)
+        for (int u = 0; u < width; ++u) {
+            const float* p = at(u, v);
+            const auto same_layer = [&](int i, int j) {  // the neighbour, or the pixel itself
+                if (i < 0 || j < 0 || i >= width || j >= height) return p;
+                return std::abs(at(i, j)[2] - p[2]) < layer_gap ? at(i, j) : p;
+            };
+            const float *l = same_layer(u - 1, v), *r = same_layer(u + 1, v);
+            const float *a = same_layer(u, v - 1), *b = same_layer(u, v + 1);
+            const float x[3] = {r[0] - l[0], r[1] - l[1], r[2] - l[2]}, y[3] = {b[0] - a[0], b[1] - a[1], b[2] - a[2]};
+            float n[3] = {y[1] * x[2] - y[2] * x[1], y[2] * x[0] - y[0] * x[2], y[0] * x[1] - y[1] * x[0]};
+            const float norm = norm_of(n);
+            const float across = norm_of(x), down = norm_of(y);
+            const bool sound = std::min(across, down) > kMinStep * p[2] && norm > kMinSine * across * down;
+            float* out = normal + 3 * (static_cast<size_t>(v) * width + u);
+            for (int c = 0; c < 3; ++c) out[c] = sound ? n[c] / norm : kHole;
+        }
 }
 
 }  // namespace sf

@@ -1,28 +1,40 @@
-"""Keyframes of the tracker: what is kept of them, and when a new one is made."""
+"""Keyframes of the tracker: what is kept of them, where their patches lie, and when a new one is made."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, DepthMap, Float64, Frame, Keyframe, PointCloud, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float64, Frame, Keyframe, PointCloud, Scale
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import Edges
+from sf_tracking.core.bundle import project
 from sf_tracking.core.patches import Patches
+from sf_tracking.core.shape import Shape, ShapeFit
+from sf_tracking.core.update import View
+
+_LANDMARK_SIGMA = 0.2  # relative deviation of inverse depth up to which a patch is published as a landmark
+_SHEAR = (0.2, 5.0)  # change of a patch's area between two views, beyond which it is not looked for
+_MIN_FLOW = 0.25  # of the flow that makes a keyframe: without it a loss of overlap is no reason for one
 
 
 @dataclass(slots=True)
 class TrackedKeyframe:
-    """A keyframe inside the optimisation window; its pose still moves."""
+    """A keyframe inside the optimisation window; its pose and the depth of its patches still move."""
 
     frame: Frame
-    gray: UInt8
+    view: View
     patches: Patches
+    described: Any  # of the patches, by the update operator
     T_cw: Float64  # world to camera
-    observed: list[tuple[int, Edges]] = field(default_factory=list)  # (stamp of the source keyframe, its edges)
+    seen: dict[int, tuple[Float64, Float64]] = field(default_factory=dict)  # stamp -> uv [M, 2], information [M, 2, 2]
+    shape: Shape | None = None  # of its depth
+    moved: dict[int, ShapeFit] = field(default_factory=dict)  # stamp -> T_other_self by alignment of the shapes
+    best_share: float = 0.0  # of its patches found in one frame so far
 
     @property
     def camera(self) -> Camera:
@@ -30,24 +42,59 @@ class TrackedKeyframe:
         assert self.frame.camera is not None
         return self.frame.camera
 
-    def final(self) -> Keyframe:
+    def final(self, scale: Scale) -> Keyframe:
         """What leaves the window: the pose is final now."""
-        camera, frame = self.camera, self.frame
+        camera, frame, patches = self.camera, self.frame, self.patches
         assert frame.image is not None
         depth: DepthMap | None = frame.depth
         if frame.sparse_depth is not None:
             depth = frame.sparse_depth.to_map(camera.height, camera.width)
-        landmarks = PointCloud(self.patches.points.astype(np.float32), None, None, frame.stamp_ns, camera.frame_id)
-        return Keyframe(frame.stamp_ns, camera, frame.image, se3.inverse(self.T_cw), depth, landmarks)
+        known = (patches.w > 0) & (patches.sigma < _LANDMARK_SIGMA * patches.w)
+        points = patches.points(camera)[known].astype(np.float32)
+        landmarks = PointCloud(points, None, None, frame.stamp_ns, camera.frame_id)
+        return Keyframe(frame.stamp_ns, camera, frame.image, se3.inverse(self.T_cw), depth, landmarks, scale)
 
 
-def wants_keyframe(config: TrackingConfig, camera: Camera, flow_px: Float64, aligned_share: float) -> bool:
+@dataclass(frozen=True, slots=True)
+class Reprojection:
+    """The patches of one keyframe as another view has them."""
+
+    uv: Float64  # [M, 2] px
+    warp: Float64  # [M, 2, 2] how offsets from the patch centre map
+    J_w: Float64  # [M, 2] d(uv)/d(inverse depth)
+    w: Float64  # [M] inverse depth there
+    visible: NDArray[np.bool_]  # [M] inside the image and not too distorted
+
+
+def reproject(keyframe: TrackedKeyframe, T_cw: Float64) -> Reprojection:
+    """All patches of a keyframe in the view of a camera at T_cw: Pi(G_ij Pi^-1(P'_k)) with its derivatives."""
+    camera, patches = keyframe.camera, keyframe.patches
+    T = T_cw @ se3.inverse(keyframe.T_cw)
+    uv, X = project(camera, T, patches.rays(camera), patches.w)
+    z = np.where(np.isfinite(uv[:, 0]), X[:, 2], 1.0)
+    focal = np.array([camera.fx, camera.fy])
+    along = T[:3, :2] / focal + T[:3, 3][:, None] * patches.slope[:, None, :]  # [M, 3, 2] dX/d(uv)
+    scaled = focal / z[:, None]  # [M, 2]
+    on_axis = X[:, :2] / z[:, None]  # [M, 2]
+    warp = scaled[..., None] * (along[:, :2] - on_axis[..., None] * along[:, 2:])
+    J_w = scaled * (T[:2, 3] - on_axis * T[2, 3])
+    area = warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0]
+    with np.errstate(invalid="ignore"):
+        visible = (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+    visible &= (area > _SHEAR[0]) & (area < _SHEAR[1])
+    return Reprojection(uv, warp, J_w, patches.w / z, visible)
+
+
+def wants_keyframe(config: TrackingConfig, keyframe: TrackedKeyframe, flow_px: Float64, share: float) -> bool:
     """Enough motion for new information, or too little overlap to go on with the old patches.
 
+    The overlap counts relative to the best since the keyframe was made, so that a scene half of which moves
+    does not make a keyframe of every frame.
+
     Args:
-        flow_px: displacement of the newest keyframe's aligned patches, [M] px.
-        aligned_share: how many of its patches were found again, 0 to 1.
+        flow_px: displacement of the keyframe's patches found in the frame, [E] px.
+        share: how many of its patches were found again, 0 to 1.
     """
-    if aligned_share < config.keyframe_overlap:
-        return True
-    return len(flow_px) > 0 and float(flow_px.mean()) > config.keyframe_flow * camera.width
+    flow = float(flow_px.mean()) / (config.keyframe_flow * keyframe.camera.width) if len(flow_px) else 1.0
+    keyframe.best_share = max(keyframe.best_share, share)
+    return flow > 1.0 or (flow > _MIN_FLOW and share < config.keyframe_overlap * keyframe.best_share)

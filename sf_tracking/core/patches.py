@@ -1,4 +1,4 @@
-"""Patches: textured places whose depth is measured, spread over the image (P in the paper, Sec. III-A)."""
+"""Patches: textured places spread over the image, with an inverse depth each (P in the paper, Sec. III-A)."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -8,60 +8,59 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from sf_interfaces.types import Camera, Float32, Float64, Frame, SparseDepth, UInt8
+from sf_interfaces.types import Camera, Float64, Frame, UInt8
 from sf_tracking.config import TrackingConfig
 
-_NEIGHBOURHOOD = 9  # px, within which a step in depth disqualifies a patch
-_FAR = 1e6  # m, stands for no depth where the nearest is sought
-_GRADIENT_NOISE = 1e-3  # keeps the structure tensor of a flat patch invertible
+_PLANE_HALF = 4  # px, half side of the window of dense depth to which a plane is fitted
+_PLANE_NEIGHBOURS = 12  # points of sparse depth to which a plane is fitted
+_KNOWN_SHARE = 0.5  # of the window that must carry depth
+_GRAZING = 0.04  # relative change of depth per px, above which a surface is seen too flat to be measured
+_SPARES = 1.6  # candidates per wanted patch, since some fail the test of their depth
 
 
 @dataclass(frozen=True, slots=True)
+class Measured:
+    """Inverse depths measured at M places: a plane fitted to the inverse depths around each."""
+
+    w: Float64  # [M] 1/m, NaN where no depth is measured
+    sigma: Float64  # [M] its deviation
+    slope: Float64  # [M, 2] d(inverse depth)/d(uv) of the surface, 1/m/px; 0 where unknown
+    broken: NDArray[np.bool_]  # [M] beside a step in depth or seen at a grazing angle
+
+    def take(self, index: NDArray[np.int64]) -> Measured:
+        """The measurements at ``index``."""
+        return Measured(self.w[index], self.sigma[index], self.slope[index], self.broken[index])
+
+
+@dataclass(slots=True)
 class Patches:
-    """The patches of one keyframe; their inverse depth is measured and stays fixed."""
+    """The patches of one keyframe; ``w`` and ``sigma`` are refined while it is in the window."""
 
     uv: Float64  # [M, 2] continuous px
-    points: Float64  # [M, 3] m, camera frame
-    tensor: Float64  # [M, 2, 2] mean structure tensor, (grey level / px)^2
+    slope: Float64  # [M, 2] d(inverse depth)/d(uv), 1/m/px
+    w: Float64  # [M] inverse depth, 1/m
+    sigma: Float64  # [M] its deviation
+    prior: Float64  # [M] inverse depth as measured, or as expected from its neighbours
+    prior_sigma: Float64  # [M] its deviation
+    measured: NDArray[np.bool_]  # [M] the prior is a measurement
 
     def __len__(self) -> int:
         return len(self.uv)
+
+    def rays(self, camera: Camera) -> Float64:
+        """(x, y) at unit depth, [M, 2]."""
+        return (self.uv - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+
+    def points(self, camera: Camera) -> Float64:
+        """Patch centres in the camera frame, [M, 3] in the tracker's unit."""
+        return camera.unproject(self.uv, 1.0 / np.maximum(self.w, 1e-9))
 
 
 def to_gray(image: UInt8) -> UInt8:
     """Luminance [H, W] of an RGB or mono image."""
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
-
-
-def structure_tensor(gray: UInt8, side: int) -> Float32:
-    """Mean over a window of the gradient's outer product, [H, W, 3] as (xx, xy, yy)."""
-    gx = cv2.Scharr(gray, cv2.CV_32F, 1, 0, scale=1 / 32)
-    gy = cv2.Scharr(gray, cv2.CV_32F, 0, 1, scale=1 / 32)
-    return np.asarray(cv2.blur(np.dstack([gx * gx, gx * gy, gy * gy]), (side, side)))
-
-
-def _smallest_eigenvalue(t: Float32) -> Float32:
-    half_trace, half_difference = (t[..., 0] + t[..., 2]) / 2, (t[..., 0] - t[..., 2]) / 2
-    return np.asarray(half_trace - np.sqrt(half_difference**2 + t[..., 1] ** 2))
-
-
-def _continuous_depth(z: Float32, gap: float) -> NDArray[np.bool_]:
-    """Pixels in whose neighbourhood the known depths differ by less than the relative gap, [H, W]."""
-    known = np.isfinite(z)
-    kernel = np.ones((_NEIGHBOURHOOD, _NEIGHBOURHOOD), np.uint8)
-    far = cv2.dilate(np.where(known, z, 0.0).astype(np.float32), kernel)
-    near = cv2.erode(np.where(known, z, _FAR).astype(np.float32), kernel)
-    return np.asarray(known & (far < (1.0 + gap) * near))
-
-
-def _measured(frame: Frame, camera: Camera) -> tuple[SparseDepth, Float32]:
-    """Candidate places with depth, and the depth map they came from."""
-    if frame.sparse_depth is not None:
-        return frame.sparse_depth, frame.sparse_depth.to_map(camera.height, camera.width).z
-    if frame.depth is not None:
-        return SparseDepth.from_map(frame.depth), np.where(frame.depth.valid, frame.depth.z, np.nan)
-    return SparseDepth(np.zeros((0, 2)), np.zeros(0)), np.full((camera.height, camera.width), np.nan, np.float32)
 
 
 def _spread(score: Float64, uv: Float64, camera: Camera, count: int) -> NDArray[np.int64]:
@@ -73,34 +72,101 @@ def _spread(score: Float64, uv: Float64, camera: Camera, count: int) -> NDArray[
     starts = np.r_[True, np.diff(key[order]) != 0]
     first = np.maximum.accumulate(np.where(starts, np.arange(len(order)), 0))
     rank = np.arange(len(order)) - first
-    by_rank = np.lexsort((-score[order], rank))[:count]
-    return np.sort(order[by_rank])
+    return order[np.lexsort((-score[order], rank))[:count]]
 
 
-def extract(frame: Frame, gray: UInt8, config: TrackingConfig) -> Patches:
-    """Choose the patches of a new keyframe among the pixels that carry a depth.
+def _candidates(frame: Frame, gray: UInt8, config: TrackingConfig) -> tuple[Float64, Float64]:
+    """Places [C, 2] px worth a patch and their corner quality [C]: corners, or LiDAR points on texture."""
+    camera = frame.camera
+    assert camera is not None
+    # Half the resolution shows the same corners at a quarter of the cost.
+    corner = cv2.cornerMinEigenVal(cv2.pyrDown(gray), config.patch_px // 2, ksize=3)
+    border = config.patch_px // 2 + 2
+    if frame.sparse_depth is not None:
+        uv = frame.sparse_depth.uv
+        inside = (uv >= border).all(axis=1) & (uv < (camera.width - border, camera.height - border)).all(axis=1)
+        uv = uv[inside & (frame.sparse_depth.z[: len(inside)] < config.max_depth)]
+        col, row = np.floor(uv / 2).astype(np.int64).T
+    else:
+        peak = corner >= cv2.dilate(corner, np.ones((3, 3), np.uint8))
+        edge = border // 2 + 1
+        peak[:edge], peak[-edge:], peak[:, :edge], peak[:, -edge:] = False, False, False, False
+        row, col = np.nonzero(peak)
+        uv = np.stack([2 * col + 0.5, 2 * row + 0.5], axis=-1)
+    score = corner[row, col].astype(np.float64)
+    good = score > config.min_quality * float(corner.max())
+    return uv[good], score[good]
 
-    Dense depth is thinned to corners, sparse depth to its best textured points; places beside a step in
-    depth are left out, since there the texture and the depth may belong to different surfaces.
+
+def _fit_planes(offset: Float64, w: Float64, weight: Float64) -> tuple[Float64, Float64, Float64]:
+    """Weighted fit ``w = w0 + slope . offset``: w0 [C], slope [C, 2] and the residual's deviation [C].
+
+    Args:
+        offset: [C, K, 2] px; w: [C, K] inverse depths; weight: [C, K], 0 where there is none.
+    """
+    A = np.concatenate([np.ones((*w.shape, 1)), offset], axis=-1)
+    At = (A * weight[..., None]).transpose(0, 2, 1)
+    plane = np.linalg.solve(At @ A + 1e-9 * np.eye(3), At @ w[..., None])[..., 0]
+    left = (w - (A @ plane[..., None])[..., 0]) ** 2 * weight
+    return plane[:, 0], plane[:, 1:], np.sqrt(left.sum(axis=1) / np.maximum(weight.sum(axis=1) - 3, 1.0))
+
+
+def _neighbourhood(frame: Frame, uv: Float64) -> tuple[Float64, Float64]:
+    """Offsets [C, K, 2] px and inverse depths [C, K] (NaN: none) of the measured depths round each place."""
+    sparse = frame.sparse_depth
+    if sparse is not None:
+        near = cKDTree(sparse.uv).query(uv, k=min(_PLANE_NEIGHBOURS, len(sparse)))[1].reshape(len(uv), -1)
+        return sparse.uv[near] - uv[:, None], 1.0 / sparse.z[near]
+    assert frame.depth is not None
+    dv, du = (g.ravel() for g in np.mgrid[-_PLANE_HALF : _PLANE_HALF + 1, -_PLANE_HALF : _PLANE_HALF + 1])
+    col, row = np.floor(uv).astype(np.int64).T
+    height, width = frame.depth.z.shape
+    rows, cols = np.clip(row[:, None] + dv, 0, height - 1), np.clip(col[:, None] + du, 0, width - 1)
+    z = frame.depth.z[rows, cols].astype(np.float64)
+    w = np.where(z > 0, 1.0 / np.where(z > 0, z, 1.0), np.nan)
+    return np.stack([cols + 0.5, rows + 0.5], axis=-1) - uv[:, None], w
+
+
+def measure(frame: Frame, uv: Float64, config: TrackingConfig) -> Measured:
+    """What the frame's depth says about the places ``uv`` [M, 2]."""
+    count = len(uv)
+    no_depth = frame.depth is None and (frame.sparse_depth is None or len(frame.sparse_depth) < _PLANE_NEIGHBOURS)
+    if no_depth or count == 0:
+        nan = np.full(count, np.nan)
+        return Measured(nan, nan, np.zeros((count, 2)), np.zeros(count, dtype=bool))
+    offset, w = _neighbourhood(frame, uv)
+    known = np.isfinite(w)
+    w = np.where(known, w, 0.0)
+    w0, slope, rough = _fit_planes(offset, w, known.astype(np.float64))
+    z = 1.0 / np.maximum(w0, 1e-3)
+    # Structured light errs with z^2, that is alike in inverse depth; LiDAR alike in depth.
+    dense = frame.sparse_depth is None
+    model = np.full(count, config.depth_sigma) if dense else config.lidar_sigma / z**2
+    spread = np.where(known, np.abs(w - w0[:, None] - np.einsum("ckj,cj->ck", offset, slope)), 0.0).max(axis=1)
+    broken = spread > np.maximum(config.depth_gap * w0, 6 * model)
+    if dense:
+        broken |= np.abs(slope).max(axis=1) > _GRAZING * w0
+    enough = (known.mean(axis=1) >= _KNOWN_SHARE) & (w0 > 1.0 / config.max_depth)
+    # A smooth sensor earns trust, but never beyond a part of its model: offsets do not show in the residual.
+    sigma = np.hypot(0.25 * model, rough)
+    w0 = np.where(enough, w0, np.nan)
+    return Measured(w0, np.where(enough, sigma, np.nan), np.where(enough[:, None], slope, 0.0), broken & enough)
+
+
+def extract(frame: Frame, gray: UInt8, config: TrackingConfig) -> tuple[Float64, Measured]:
+    """Places uv [M, 2] px of the patches of a new keyframe, and the inverse depth measured at each.
+
+    Places beside a step in depth are left out, since there the texture and the depth may belong to different
+    surfaces. Places without depth only fill up what places with depth leave.
     """
     camera = frame.camera
     assert camera is not None
-    tensor = structure_tensor(gray, config.patch_px)
-    corner = _smallest_eigenvalue(tensor)
-    candidates, z_map = _measured(frame, camera)
-    col, row = np.floor(candidates.uv).astype(np.int64).T
-    border = config.patch_px // 2 + 1
-    inside = (col >= border) & (col < camera.width - border) & (row >= border) & (row < camera.height - border)
-    col, row, uv, z = col[inside], row[inside], candidates.uv[inside], candidates.z[inside]
-    steady = _continuous_depth(z_map, config.depth_gap)
-    score = corner[row, col].astype(np.float64)
-    good = steady[row, col] & (z < config.max_depth) & (score > config.min_quality * float(corner.max()))
-    if frame.sparse_depth is None:
-        peaks = cv2.dilate(corner, np.ones((5, 5), np.uint8))
-        good &= corner[row, col] >= peaks[row, col]
-    uv, z, score, col, row = uv[good], z[good], score[good], col[good], row[good]
-    chosen = _spread(score, uv, camera, config.patches) if len(uv) else np.zeros(0, dtype=np.int64)
-    t = tensor[row[chosen], col[chosen]].astype(np.float64)
-    matrices = np.stack([t[:, 0], t[:, 1], t[:, 1], t[:, 2]], axis=-1).reshape(-1, 2, 2)
-    matrices = matrices + _GRADIENT_NOISE * np.eye(2)
-    return Patches(uv[chosen], camera.unproject(uv[chosen], z[chosen]), matrices)
+    uv, score = _candidates(frame, gray, config)
+    if len(uv) == 0:
+        return uv.reshape(0, 2), measure(frame, uv.reshape(0, 2), config)
+    chosen = _spread(score, uv, camera, round(_SPARES * config.patches))
+    uv = uv[chosen]
+    found = measure(frame, uv, config)
+    order = np.argsort(np.isnan(found.w), kind="stable")  # measured ones first, each in the order of choice
+    kept = np.sort(order[~found.broken[order]][: config.patches])
+    return uv[kept], found.take(kept)

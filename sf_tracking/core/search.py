@@ -39,7 +39,7 @@ def relocate(
         T_wc = se3.inverse(keyframe.T_cw)
         for pair in matcher.knnMatch(wanted, descriptors, k=2):
             if len(pair) == 2 and pair[0].distance < _RATIO * pair[1].distance:
-                world.append(se3.transform(T_wc, keyframe.patches.points[known[pair[0].queryIdx]]))
+                world.append(se3.transform(T_wc, keyframe.patches.points(camera)[known[pair[0].queryIdx]]))
                 pixels.append(corners[pair[0].trainIdx].pt)
     if len(world) < config.min_inliers:
         return None
@@ -50,12 +50,12 @@ def _described(orb: cv2.ORB, keyframe: TrackedKeyframe) -> tuple[list[int], np.n
     """Indices of the patches that ORB could describe, and their descriptors."""
     uv = keyframe.patches.uv - 0.5
     points = [cv2.KeyPoint(float(u), float(v), 31.0, -1.0, 0.0, 0, i) for i, (u, v) in enumerate(uv)]
-    angled = orb.detect(keyframe.gray, None)
+    angled = orb.detect(keyframe.view.gray, None)
     if angled:  # a patch takes the orientation of the nearest corner, so that rotation does not break matching
         spots = np.array([k.pt for k in angled])
         for point in points:
             point.angle = angled[int(np.argmin(np.abs(spots - point.pt).sum(axis=1)))].angle
-    kept, descriptors = orb.compute(keyframe.gray, points)
+    kept, descriptors = orb.compute(keyframe.view.gray, points)
     return [k.class_id for k in kept], descriptors
 
 

@@ -4,47 +4,64 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sf_interfaces.types import Float64, UInt8
+from sf_interfaces.types import Float32, Float64, UInt8
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.patches import Patches
+from sf_tracking.core.align import Templates, align, describe
 
-_REACH = 0.5  # of the patch side: how far alignment may move a patch on the finest level of a known motion
 _CONTRAST, _MIDDLE = 45.0, 128.0  # grey levels of a normalised image: standard deviation and mean
-_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01)
+_MAX_GAIN = 4.0  # change of contrast between two sights of a patch
+_REACH = 0.5  # of the patch side: how far alignment may move a patch from where the search left it
+_STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """An image prepared once for all its edges."""
+
+    gray: UInt8  # [H, W] in normal contrast, for corners, search and descriptors
+    fine: Float32  # [H, W] grey levels as they are, for alignment
 
 
 @dataclass(frozen=True, slots=True)
 class Update:
     """Where the patches were found: target = reprojection + delta, with its information."""
 
-    target: Float64  # [M, 2] continuous px
-    information: Float64  # [M, 2, 2] 1/px^2, Sigma_kj^-1 of the paper
-    valid: NDArray[np.bool_]  # [M]
+    target: Float64  # [E, 2] continuous px
+    information: Float64  # [E, 2, 2] 1/px^2, Sigma_kj^-1 of the paper
+    valid: NDArray[np.bool_]  # [E]
 
 
 class UpdateOperator(Protocol):
-    """Maps patches of one image and their reprojections into another to corrected positions."""
+    """Maps patches of keyframes and their reprojections into an image to corrected positions."""
 
-    def prepare(self, gray: UInt8) -> UInt8:
+    def view(self, gray: UInt8) -> View:
         """Prepare an image [H, W] once for all its edges."""
         ...
 
-    def __call__(self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool) -> Update:
-        """Align ``patches`` of ``source`` in ``target``, starting from ``start`` [M, 2] px.
+    def describe(self, view: View, uv: Float64) -> Any:
+        """What is kept of the patches at ``uv`` [M, 2] px; has ``take(index)`` and ``concatenate(list)``."""
+        ...
 
-        ``wide`` asks for the full search range because the motion is not known.
+    def __call__(self, patches: Any, target: View, start: Float64, warp: Float64) -> Update:
+        """Correct E reprojections.
+
+        Args:
+            patches: descriptions of E patches.
+            target: the image they are looked for in.
+            start: [E, 2] px, the reprojections.
+            warp: [E, 2, 2] how offsets from the patch centre map into the target.
         """
         ...
 
 
 class PatchAlignment:
-    """Training-free operator: pyramidal Lucas-Kanade from the reprojection, checked backwards.
+    """Training-free operator: inverse compositional alignment with gain and bias, from the reprojection.
 
     The information of an edge is the patch's structure tensor over the variance of the grey-level residual:
     certain along gradients, uncertain along edges of the image, weaker where the patches differ.
@@ -52,54 +69,72 @@ class PatchAlignment:
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
-        self._window = (config.patch_px, config.patch_px)
 
-    def prepare(self, gray: UInt8) -> UInt8:
-        """The image in normal contrast, so that changes of exposure do not read as motion."""
+    def view(self, gray: UInt8) -> View:
+        """See :class:`UpdateOperator`; changes of exposure do not read as motion in the search either."""
         mean, deviation = cv2.meanStdDev(gray)
         gain = _CONTRAST / max(float(deviation[0, 0]), 1.0)
-        return np.asarray(cv2.convertScaleAbs(gray, alpha=gain, beta=_MIDDLE - gain * float(mean[0, 0])))
+        normal = cv2.convertScaleAbs(gray, alpha=gain, beta=_MIDDLE - gain * float(mean[0, 0]))
+        fine = cv2.GaussianBlur(gray.astype(np.float32), (3, 3), 0.6)
+        return View(np.asarray(normal), np.asarray(fine))
 
-    def _flow(
-        self, a: UInt8, b: UInt8, points: NDArray[np.float32], start: NDArray[np.float32], levels: int
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
-        found, status, error = cv2.calcOpticalFlowPyrLK(
-            a,
-            b,
-            points,
-            start.copy(),
-            winSize=self._window,
-            maxLevel=levels,
-            criteria=_STOP,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=1e-5,
-        )
-        ok = status.ravel().astype(bool)
-        # OpenCV leaves position and error undefined where it found nothing.
-        return np.where(ok[:, None], found, points), ok, np.where(ok, error.ravel(), 0.0)
+    def describe(self, view: View, uv: Float64) -> Templates:
+        """See :class:`UpdateOperator`."""
+        return describe(view.fine, uv, self._config.patch_px)
 
-    def __call__(self, source: UInt8, patches: Patches, target: UInt8, start: Float64, *, wide: bool) -> Update:
+    def __call__(self, patches: Templates, target: View, start: Float64, warp: Float64) -> Update:
         """See :class:`UpdateOperator`."""
         c = self._config
-        count = len(patches)
-        if count == 0:
-            return Update(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0, dtype=bool))
-        height, width = target.shape
-        levels = c.wide_levels if wide else c.levels
-        # OpenCV counts pixel centres from 0, the project from 0.5.
-        points = (patches.uv - 0.5).astype(np.float32)
-        guess = (start - 0.5).astype(np.float32)
-        inside = (guess >= -c.patch_px).all(1) & (guess < np.float32([width, height]) + c.patch_px).all(1)
-        inside &= np.isfinite(guess).all(axis=1)
-        guess[~inside] = points[~inside]
-        found, ok, error = self._flow(source, target, points, guess, levels)
-        back, ok_back, _ = self._flow(target, source, found, points, min(levels, 1))
-        border = c.patch_px // 2
-        ok &= inside & ok_back & (np.linalg.norm(back - points, axis=1) < 1.0) & (error < c.max_residual)
-        ok &= (found >= border).all(axis=1) & (found < np.float32([width, height]) - border - 1).all(axis=1)
-        if not wide:
-            ok &= np.linalg.norm(found - guess, axis=1) < _REACH * c.patch_px * 2**levels
-        variance = c.image_sigma**2 + error.astype(np.float64) ** 2
-        covariance = np.linalg.inv(patches.tensor) * (variance / c.patch_px**2)[:, None, None]
-        covariance += c.position_sigma**2 * np.eye(2)
-        return Update(found.astype(np.float64) + 0.5, np.linalg.inv(covariance), ok)
+        found = align(target.fine, patches, start, warp, c.iterations)
+        height, width = target.fine.shape
+        border = c.patch_px / 2
+        inside = (found.centre >= border).all(axis=1) & (found.centre <= (width - border, height - border)).all(axis=1)
+        alike = (found.explained > c.min_explained) | (found.residual < c.image_sigma)
+        ok = inside & alike & (found.residual < c.max_residual) & (found.gain > 1 / _MAX_GAIN)
+        ok &= (found.gain < _MAX_GAIN) & (np.linalg.norm(found.centre - start, axis=1) < _REACH * c.patch_px)
+        covariance = found.covariance + c.position_sigma**2 * np.eye(2)
+        return Update(found.centre, np.linalg.inv(covariance), ok)
+
+
+def search(
+    config: TrackingConfig, source: View, uv: Float64, target: View, start: Float64, *, wide: bool
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Pyramidal Lucas-Kanade of patches ``uv`` [M, 2] from ``start`` [M, 2] px, checked backwards.
+
+    ``wide`` searches all levels because the motion is not known. Returns positions [M, 2] and success [M].
+    """
+    if len(uv) == 0:
+        return uv.copy(), np.zeros(0, dtype=bool)
+    levels = config.wide_levels if wide else config.levels
+    side = config.search_px
+    height, width = target.gray.shape
+    # OpenCV counts pixel centres from 0, the project from 0.5.
+    points = (uv - 0.5).astype(np.float32)
+    guess = (start - 0.5).astype(np.float32)
+    inside = np.isfinite(guess).all(axis=1)
+    inside &= (guess >= -side).all(1) & (guess < np.float32([width, height]) + side).all(1)
+    guess[~inside] = points[~inside]
+    found, ok = _flow(source, target, points, guess, levels, side)
+    back, ok_back = _flow(target, source, found, points, 1, side)
+    ok &= inside & ok_back & (np.linalg.norm(back - points, axis=1) < 1.0)
+    ok &= (found >= 0).all(axis=1) & (found < np.float32([width, height])).all(axis=1)
+    return found.astype(np.float64) + 0.5, ok
+
+
+def _flow(
+    a: View, b: View, points: Float32, start: Float32, levels: int, side: int
+) -> tuple[Float32, NDArray[np.bool_]]:
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        a.gray,
+        b.gray,
+        points,
+        start.copy(),
+        winSize=(side, side),
+        maxLevel=levels,
+        criteria=_STOP,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-5,
+    )
+    ok = status.ravel().astype(bool)
+    # OpenCV leaves the position undefined where it found nothing.
+    return np.where(ok[:, None], found, points), ok

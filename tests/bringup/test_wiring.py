@@ -16,6 +16,7 @@ from sf_interfaces.errors import ConfigError, PlanError
 Q = Quantity
 ROLES = {"rgb": "/cam/image_raw", "camera_info": "/cam/camera_info"}
 EMPTY = ConfigFile({})
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
 IMAGE, INFO, CLOUD = topics.RGB_IMAGE.type, topics.RGB_INFO.type, topics.LIDAR_POINTS.type
 
 
@@ -112,3 +113,48 @@ def test_wrong_choices_of_the_user_are_explained() -> None:
         discover(types, {}, {"colour": "/a/image_raw"})
     with pytest.raises(ConfigError, match="lidar needs"):
         discover(types, {}, {"lidar": "/a/image_raw"})
+
+
+def test_compressed_topics_play_the_roles_of_images_and_nodes_are_told() -> None:
+    color, depth = "/robot/cam/color/image_raw/compressed", "/robot/cam/depth/image_raw/compressedDepth"
+    types = {color: COMPRESSED, depth: COMPRESSED, "/robot/cam/color/camera_info": INFO}
+    found = discover(types, {color: Probe("rgb8"), depth: Probe("16UC1", "", 0.9)})
+    assert found.roles == {"rgb": color, "depth": depth, "camera_info": "/robot/cam/color/camera_info"}
+    assert found.compressed == {"rgb", "depth"}
+    assert any("a colour image, compressed" in reason for reason in found.reasons)
+    made = plan(found.available, "recon", load_blocks())
+    tracking, _ = launches(made, found.roles, EMPTY, lossless=False, compressed=found.compressed)
+    assert tracking.parameters["sync.compressed"] == ["image", "depth"]
+
+
+def test_the_flexion_image_is_never_compressed() -> None:
+    made = plan({Q.INTRINSICS, Q.DEPTH}, "tracking", load_blocks())
+    flexion, tracking = launches(
+        made, {"depth": "/d/compressedDepth", "camera_info": "/i"}, EMPTY, lossless=False, compressed={"depth"}
+    )
+    assert flexion.parameters["sync.compressed"] == tracking.parameters["sync.compressed"] == ["depth"]
+
+
+def test_a_raw_image_wins_over_the_same_one_compressed() -> None:
+    types = {"/c/image_raw/compressed": COMPRESSED, "/c/image_raw": IMAGE, "/c/camera_info": INFO}
+    found = discover(types, {name: Probe("rgb8") for name in types if name != "/c/camera_info"})
+    assert found.roles["rgb"] == "/c/image_raw" and not found.compressed
+    assert any("/c/image_raw/compressed left out" in reason for reason in found.reasons)
+
+
+def test_of_several_cameras_the_one_with_depth_is_taken_and_its_own_depth() -> None:
+    names = ("/a_back/color/image_raw", "/front/color/image_raw", "/zed/depth/image", "/front/depth/image_raw")
+    types = dict.fromkeys(names, IMAGE) | {f"{n.rsplit('/', 1)[0]}/camera_info": INFO for n in names}
+    probes = {n: Probe("16UC1" if "depth" in n else "bgr8", n.split("/")[1], 0.9) for n in names}
+    found = discover(types, probes)
+    assert found.roles["rgb"] == "/front/color/image_raw" and found.roles["depth"] == "/front/depth/image_raw"
+    text = "\n".join(found.reasons)
+    assert "/a_back/color/image_raw left out" in text and "/zed/depth/image left out" in text
+
+
+def test_an_image_that_cannot_be_read_is_left_out_with_its_reason() -> None:
+    types = {"/c/image_raw": IMAGE, "/c/camera_info": INFO, "/c/depth/compressed": COMPRESSED}
+    probes = {"/c/image_raw": Probe("rgb8"), "/c/depth/compressed": Probe(problem="depth went through a lossy codec")}
+    found = discover(types, probes)
+    assert "depth" not in found.roles
+    assert any("lossy codec" in reason for reason in found.reasons)

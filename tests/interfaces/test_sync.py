@@ -238,3 +238,45 @@ def test_depth_leads_where_there_is_no_image() -> None:
     assembler.push_depth(7, DepthMap(np.ones((24, 32))), "cam")
     (frame,) = assembler.ready()
     assert frame.image is None and frame.depth is not None and frame.stamp_ns == 7
+
+
+WIDE = Camera(32, 24, 20.0, 20.0, 16.0, 12.0, "cam")
+
+
+@pytest.mark.parametrize("info_first", [True, False])
+def test_frames_carry_the_calibration_valid_at_their_stamp(info_first: bool) -> None:
+    assembler, frames = FrameAssembler(), []
+    for i, camera in enumerate([CAMERA, CAMERA, CAMERA, WIDE, WIDE, WIDE]):
+        pushes = [
+            lambda i=i, camera=camera: assembler.push_camera(camera, None, (i + 1) * 100 * MS),
+            lambda i=i: assembler.push_image((i + 1) * 100 * MS, _image(i), "cam"),
+        ]
+        for push in pushes if info_first else reversed(pushes):
+            push()
+            frames += assembler.ready()
+    assembler.end()
+    frames += assembler.ready()
+    assert [f.camera for f in frames] == [CAMERA] * 3 + [WIDE] * 3
+    assert sum("changed: frames use the new" in reason for reason in assembler.reasons) == 1
+
+
+def test_autofocus_jitter_does_not_change_the_calibration() -> None:
+    assembler = FrameAssembler()
+    for i in range(5):
+        focus = Camera(32, 24, 30.0 + 0.02 * i, 30.0, 16.0, 12.0, "cam")
+        assembler.push_camera(focus, None, (i + 1) * 100 * MS)
+        assembler.push_image((i + 1) * 100 * MS, _image(i), "cam")
+    assert {f.camera for f in assembler.ready()} == {CAMERA}
+    assert sum(n for r, n in assembler.reasons.items() if "too little" in r) == 4
+
+
+def test_a_calibration_sent_once_holds_back_nothing() -> None:
+    assembler = FrameAssembler()
+    assembler.push_camera(CAMERA, None, 1)
+    assembler.push_image(900 * MS, _image(0), "cam")
+    assert len(list(assembler.ready())) == 1
+    assembler.push_camera(CAMERA, None, 2)  # now a change may be on its way, but not for ever
+    assembler.push_image(1000 * MS, _image(1), "cam")
+    assert not list(assembler.ready()) and "camera_info" in assembler.waiting_for
+    assembler.push_image(5000 * MS, _image(2), "cam")
+    assert [f.stamp_ns for f in assembler.ready()] == [1000 * MS]

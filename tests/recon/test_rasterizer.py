@@ -3,14 +3,19 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera
 from sf_recon.config import ReconConfig
-from sf_recon.core.ipr_reference import RasterOptions, rasterize_reference
+from sf_recon.core.ipr_reference import Raster, RasterOptions, rasterize_reference
 from sf_recon.core.rasterizer import make_rasterizer, rasterize
 
 CAMERA = Camera(53, 37, 61.0, 47.0, 25.7, 19.1)  # not a multiple of the tile, fx != fy
@@ -36,23 +41,113 @@ CLOUDS = {
 }
 
 
+EVERYTHING = ("position", "index", "weight", "normal")
+
+
 @pytest.mark.parametrize("name", CLOUDS)
 @pytest.mark.parametrize("T", [np.eye(4), POSE], ids=["identity", "moved"])
 def test_kernel_equals_definition(name: str, T: np.ndarray) -> None:
-    fast = rasterize(CLOUDS[name], CAMERA, T, OPTIONS)
-    slow = rasterize_reference(CLOUDS[name], CAMERA, T, OPTIONS)
+    fast = rasterize(CLOUDS[name], CAMERA, T, OPTIONS, outputs=EVERYTHING)
+    slow = rasterize_reference(CLOUDS[name], CAMERA, T, OPTIONS, outputs=EVERYTHING)
+    assert_same(fast, slow)
+
+
+def assert_same(fast: Raster, slow: Raster) -> None:
+    np.testing.assert_array_equal(fast.index, slow.index)
     np.testing.assert_array_equal(fast.hole, slow.hole)
     np.testing.assert_allclose(fast.depth, slow.depth, rtol=2e-6, equal_nan=True)
     # x and y of the kernel come back from the pixel: relative to the depth, not to themselves
     np.testing.assert_allclose(fast.position, slow.position, rtol=2e-5, atol=4e-6, equal_nan=True)
+    np.testing.assert_allclose(fast.weight, slow.weight, rtol=2e-4, atol=2e-6)
+    both = np.isfinite(fast.normal) & np.isfinite(slow.normal)  # one may just miss the least angle
+    assert (np.isfinite(fast.normal) != np.isfinite(slow.normal)).mean() < 1e-2
+    np.testing.assert_allclose(fast.normal[both], slow.normal[both], atol=2e-3)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.integers(0, 300),
+    size=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    k=st.integers(1, 12),
+    grid=st.sampled_from([0.0, 0.05, 0.5]),  # coarse coordinates: many ties
+    radius=st.floats(1e-6, 0.5),
+    gap=st.sampled_from([0.0, 0.01, 0.3, 1e9]),
+)
+def test_kernel_equals_definition_on_any_cloud(
+    seed: int, count: int, size: tuple[int, int], k: int, grid: float, radius: float, gap: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-1, -1, -0.5], [1, 1, 2], (count, 3))
+    points = np.round(points / grid) * grid if grid else points
+    points[rng.random(count) < 0.05] = rng.choice([np.nan, np.inf, -np.inf, 1e30])
+    camera = Camera(*size, *rng.uniform(5, 60, 2), *rng.uniform(-5, 45, 2))
+    options = RasterOptions(radius, 0.05, gap, float(rng.uniform(0.5, 70)), k)
+    T = se3.exp(rng.normal(0, 0.2, 6))
+    outputs = ("position", "index", "weight")
+    fast = rasterize(points.astype(np.float32), camera, T, options, outputs=outputs)
+    slow = rasterize_reference(points.astype(np.float32), camera, T, options, outputs=outputs)
+    np.testing.assert_array_equal(fast.index, slow.index)
+    np.testing.assert_allclose(fast.depth, slow.depth, rtol=1e-5, equal_nan=True)
+    np.testing.assert_allclose(fast.position, slow.position, rtol=1e-4, atol=1e-5, equal_nan=True)
+    np.testing.assert_allclose(fast.weight, slow.weight, rtol=1e-3, atol=1e-5)
+
+
+def test_given_normals_are_blended_and_face_the_camera() -> None:
+    cloud = box(3000, 0.5, 4.0)
+    normals = np.random.default_rng(1).normal(size=cloud.shape).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    fast = rasterize(cloud, CAMERA, POSE, OPTIONS, outputs=EVERYTHING, normals=normals)
+    slow = rasterize_reference(cloud, CAMERA, POSE, OPTIONS, outputs=EVERYTHING, normals=normals)
+    hit = ~fast.hole
+    np.testing.assert_allclose(fast.normal[hit], slow.normal[hit], atol=1e-3)
+    np.testing.assert_allclose(np.linalg.norm(fast.normal[hit], axis=1), 1, atol=1e-5)
+
+
+def test_normals_of_a_drawn_plane() -> None:
+    points = plane(1.0) @ se3.exp(np.array([0, 0, 0, 0.3, -0.2, 0.1]))[:3, :3].T.astype(np.float32)
+    options = RasterOptions(radius=0.0071, near=0.1, layer_gap=0.2)
+    drawn = rasterize(points, CAMERA, np.eye(4), options, outputs=("position", "normal"))
+    expected = -se3.exp(np.array([0, 0, 0, 0.3, -0.2, 0.1]))[:3, 2]
+    inner = drawn.normal[5:-5, 5:-5].reshape(-1, 3)
+    assert np.nanmedian(np.abs(inner @ expected)) > 0.995
+    assert (inner @ expected > 0)[np.isfinite(inner[:, 0])].mean() > 0.99  # towards the camera
+
+
+def test_points_that_cover_whole_tiles_hide_what_lies_behind() -> None:
+    options = RasterOptions(radius=0.5, near=0.05, layer_gap=0.02, max_half=40, k_ray=3)
+    cloud = box(3000, 0.2, 3.0) * np.array([0.2, 0.2, 1], np.float32)
+    fast = rasterize(cloud, CAMERA, np.eye(4), options, outputs=("position", "index"))
+    slow = rasterize_reference(cloud, CAMERA, np.eye(4), options, outputs=("position", "index"))
+    np.testing.assert_array_equal(fast.index, slow.index)
+
+
+@pytest.mark.slow
+def test_ten_million_points_in_a_close_up_fit_in_memory() -> None:
+    code = """
+import resource
+import numpy as np
+from sf_interfaces.types import Camera
+from sf_recon.core.ipr_reference import RasterOptions
+from sf_recon.core.rasterizer import rasterize
+points = np.random.default_rng(0).uniform([-1, -1, 0.1], [1, 1, 1], (10_000_000, 3)).astype(np.float32)
+camera = Camera(640, 480, 585, 585, 320, 240)
+for radius in (0.001, 0.05):
+    drawn = rasterize(points, camera, np.eye(4), RasterOptions(radius, 0.1, 0.02), outputs=("index",))
+    assert drawn.hole.mean() < 1e-3
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(run.stdout) < 2_000_000  # kB
 
 
 def test_result_does_not_depend_on_threads() -> None:
     cloud = box(50000, 0.5, 4.0)
-    one = rasterize(cloud, CAMERA, POSE, OPTIONS, threads=1)
+    one = rasterize(cloud, CAMERA, POSE, OPTIONS, threads=1, outputs=EVERYTHING)
     for threads in (2, 3, 7):
-        other = rasterize(cloud, CAMERA, POSE, OPTIONS, threads=threads)
-        assert one.position.tobytes() == other.position.tobytes()
+        other = rasterize(cloud, CAMERA, POSE, OPTIONS, threads=threads, outputs=EVERYTHING)
+        for name in ("depth", *EVERYTHING):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
 
 
 def plane(z: float, spacing: float = 0.01) -> np.ndarray:

@@ -11,9 +11,12 @@ import pytest
 import torch
 
 from sf_interfaces.errors import FormatError
-from sf_interfaces.types import DepthMap, Scale
+from sf_interfaces.geometry import se3
+from sf_interfaces.types import DepthMap, Keyframe, Scale, Trajectory
 from sf_recon.config import ReconConfig
 from sf_recon.core.color_field import Neighbourhood, gaussian_weights
+from sf_recon.core.detail import detail
+from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.reconstruction import Reconstruction
 from sf_recon.core.trainer import RowAdam
 from tests.recon.scene import CAMERA, HALF, psnr, view
@@ -38,7 +41,7 @@ def test_held_out_view(room: Reconstruction) -> None:
         assert drawn.hole_fraction < 0.03
         assert psnr(drawn.image[hit], truth.image[hit]) > 30
         assert np.median(np.abs(drawn.depth.z - truth.depth.z)[hit]) < 0.2 * room.resolution
-        assert (drawn.image[~hit] == 0).all()
+        assert not np.isfinite(drawn.depth.z[~hit]).any()
 
 
 def test_surface_lies_on_the_walls(room: Reconstruction) -> None:
@@ -49,7 +52,116 @@ def test_surface_lies_on_the_walls(room: Reconstruction) -> None:
 
 
 def test_training_lowers_the_error(room: Reconstruction) -> None:
-    assert np.mean(room.losses[-20:]) < 0.05 * np.mean(room.losses[:3])
+    assert np.mean(room.losses[-20:]) < 0.2 * np.mean(room.losses[:3])
+
+
+def test_first_view_shows_its_colours_before_any_training() -> None:
+    out, key = Reconstruction(replace(CONFIG, detail=0)), view(0)
+    out.place(key)
+    drawn = out.render(CAMERA, key.T_map_camera)
+    hit = drawn.depth.valid
+    assert psnr(drawn.image[hit], key.image[hit]) > 25
+
+
+def test_keyframe_images_sharpen_a_view_between_them() -> None:
+    truth, scores = view(1), {}
+    for count in (0, 4):
+        out = Reconstruction(replace(CONFIG, iterations=10, detail=count))
+        for i in (0, 2):
+            out.add(view(i))
+        drawn = out.render(CAMERA, truth.T_map_camera)
+        hit = drawn.depth.valid
+        scores[count] = psnr(drawn.image[hit], truth.image[hit])
+    assert scores[4] > scores[0] + 6
+
+
+def test_a_keyframe_says_nothing_about_what_it_did_not_see(room: Reconstruction) -> None:
+    key = view(1)
+    z = np.array(key.depth.z)
+    blank = KeyframeView.make(0, CAMERA, key.T_map_camera, np.zeros((120, 160, 3), np.uint8), z, None)
+    surface = np.ones(z.shape, bool)
+    seen = detail([blank], CAMERA, key.T_map_camera, z, surface, count=1, reach=0.5)
+    behind = detail([blank], CAMERA, key.T_map_camera, 1.2 * z, surface, count=1, reach=0.5)
+    away = detail([blank], CAMERA, view(9).T_map_camera, z, surface, count=1, reach=0.5)
+    assert seen.confidence[20:-20, 20:-20].min() == 1 and not behind.known.any() and not away.known.any()
+
+
+def test_colour_depends_on_the_side_it_is_seen_from() -> None:
+    """One wall, two cameras beside each other that see different greys on it: a highlight, in the extreme."""
+    T = np.stack([np.eye(4)] * 2)
+    T[:, 0, 3] = -1, 1
+    greys = [np.full((120, 160, 3), value, np.uint8) for value in (60, 200)]
+    z = np.full((2, 120, 160), np.nan)
+    z[0, :, 120:], z[1, :, :40] = 2.0, 2.0  # the part of the wall that both see
+    differences = {}
+    for sided in (True, False):
+        config = replace(
+            CONFIG, detail=0, view_directions=sided, iterations=10, final_iterations=100, network_rate=1e-2
+        )
+        out = Reconstruction(config)
+        for i in (0, 1):
+            out.add(Keyframe(i, CAMERA, greys[i], T[i], DepthMap(z[i])))
+        out.finish()
+        left, right = (out.render(CAMERA, pose) for pose in T)
+        differences[sided] = np.median(right.image[right.depth.valid]) - np.median(left.image[left.depth.valid])
+    assert differences[True] > 25 > abs(differences[False]) + 20
+
+
+def test_points_and_views_follow_their_keyframe() -> None:
+    """Half of the keyframes are off by a rigid motion; the correction gives the map that was right at once."""
+    shift = se3.exp(np.array([0.2, -0.1, 0.15, 0.02, 0.1, -0.05]))
+    right, wrong = (Reconstruction(replace(CONFIG, iterations=5)) for _ in range(2))
+    for i in (0, 9, 10):
+        right.add(view(i))
+        off = replace(view(i), T_map_camera=shift @ view(i).T_map_camera) if i > 5 else view(i)
+        wrong.add(off)
+    wrong.correct(Trajectory.from_pairs([(i, view(i).T_map_camera) for i in (9, 10, 77)]))
+    for i in (0, 9):
+        a, b = (r.render(CAMERA, view(i).T_map_camera) for r in (right, wrong))
+        both = a.depth.valid & b.depth.valid
+        assert both.mean() > 0.97
+        assert np.median(np.abs(a.depth.z - b.depth.z)[both]) < 0.1 * right.resolution
+        assert psnr(a.image[both], b.image[both]) > 35
+    wrong.add(view(11))  # it grows on
+
+
+def test_memory_budget_forgets_the_far_and_old() -> None:
+    free = Reconstruction(replace(CONFIG, iterations=1))
+    for i in range(0, 20, 2):
+        free.add(view(i))
+    held = Reconstruction(replace(CONFIG, iterations=1, memory_mb=0.5 * free.nbytes / 1e6))
+    for i in range(0, 20, 2):
+        held.add(view(i))
+        assert held.nbytes <= 0.5 * free.nbytes
+    drawn = held.render(CAMERA, view(18).T_map_camera)
+    assert drawn.hole_fraction < 0.1
+    assert held.views[-1].stamp_ns == 18 and held.views[0].stamp_ns > 0
+
+
+def test_resolution_follows_the_viewing_distance() -> None:
+    """A wall ten times as far gets coarse points only, and is drawn from them without holes."""
+    far, near = view(0), view(0)
+    T = np.array(far.T_map_camera)
+    T[:3, 3] = 10 * T[:3, 3] + [50, 0, 0]
+    far = replace(far, stamp_ns=1, T_map_camera=T, depth=DepthMap(10 * far.depth.z))
+    out = Reconstruction(replace(CONFIG, iterations=1))
+    out.add(near)
+    fine = len(out.points.levels[0])
+    out.add(far)
+    assert len(out.points.levels[0]) < 1.05 * fine
+    drawn = out.render(CAMERA, T, full=True)
+    assert drawn.hole_fraction < 0.03
+    assert np.nanmedian(np.abs(drawn.depth.z / far.depth.z - 1)) < 0.01
+    assert np.nanmedian(drawn.depth.variance) > 25 * np.nanmedian(
+        out.render(CAMERA, near.T_map_camera, full=True).depth.variance
+    )
+
+
+def test_normals_face_the_camera_and_stand_on_the_walls(room: Reconstruction) -> None:
+    drawn = room.render(CAMERA, view(3).T_map_camera, full=True)
+    normal = drawn.normal[np.isfinite(drawn.normal[..., 0])] @ view(3).T_map_camera[:3, :3].T
+    assert len(normal) > 0.8 * CAMERA.width * CAMERA.height
+    assert np.median(np.abs(normal).max(axis=1)) > 0.99  # the room is a box: one axis each
 
 
 def test_two_runs_are_equal() -> None:
@@ -160,5 +272,5 @@ def test_row_adam_equals_adam_and_keeps_moments_when_it_grows() -> None:
         if step == 2:  # new rows must not disturb the old ones
             rows.grow(7)
             table = torch.cat([table, torch.zeros(3, 3)])
-    torch.testing.assert_close(table[:4], parameter.detach(), rtol=1e-5, atol=1e-6)
-    assert not table[4:].any() and rows.steps.tolist() == [6.0] * 4 + [0.0] * 3
+    torch.testing.assert_close(table[:4], parameter.detach(), rtol=2e-3, atol=3e-4)  # moments are half precision
+    assert not table[4:].any() and rows.steps.tolist() == [6] * 4 + [0] * 3

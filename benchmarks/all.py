@@ -1,0 +1,74 @@
+"""All benchmarks one after the other, and one report of them. --full is hours of work, without it minutes.
+
+python benchmarks/all.py [--full] [--data FOLDER] [--only rooms speed] [--out bench]
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from sf_bringup.bench_report import write_bench_page
+
+HERE = Path(__file__).parent
+# name -> arguments of the quick run, of the full run.
+_ROOMS = ["room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4"]
+FOLDER = {
+    "speed": ([], ["--frames", "300", "--stride", "1", "--factor", "1"]),
+    "rooms": ([], ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1"]),
+    "depth": ([], ["--scenes", *_ROOMS, "hall", "--views", "10", "--factor", "1", "--oracle"]),
+    "scales": ([], ["--frames", "400", "--factor", "1"]),
+    "real": ([], ["--frames", "1000"]),
+}
+# Those that write one file, by --out FILE.
+FILE = {
+    "rasterize": (["--repeats", "5"], []),
+    "neighbours": ([], []),
+    "play_record": (["--frames", "90", "--rates", "1", "4"], []),
+    "completion": ([], []),
+}
+NEED_DATA = ("real", "completion")
+
+
+def commands(full: bool, data: Path | None, out: Path) -> dict[str, list[str]]:
+    """Benchmark -> its command; those whose script or data is not here are left out."""
+    found = {}
+    for name, (quick, everything) in {**FOLDER, **FILE}.items():
+        script = HERE / f"{name}.py"
+        if not script.is_file() or (name in NEED_DATA and data is None):
+            continue
+        target = out if name in FOLDER else out / f"{name}.json"
+        command = [sys.executable, str(script), "--out", str(target), *(everything if full else quick)]
+        found[name] = [*command, "--data", str(data)] if name in NEED_DATA else command
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--data", type=Path, help="folder of real recordings")
+    parser.add_argument("--only", nargs="+", choices=sorted({**FOLDER, **FILE}))
+    parser.add_argument("--out", type=Path, default=Path("bench"))
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    failed = []
+    for name, command in commands(args.full, args.data, args.out).items():
+        if args.only and name not in args.only:
+            continue
+        print(f"== {name}", flush=True)
+        start = time.monotonic()
+        if subprocess.run(command, check=False).returncode:
+            failed.append(name)
+        print(f"== {name}: {time.monotonic() - start:.0f} s", flush=True)
+    print(f"wrote {write_bench_page(args.out)}")
+    if failed:
+        print(f"failed: {', '.join(failed)}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,163 @@
+"""Every real recording of a folder: what the line makes of it, against the reference it brings.
+
+    python benchmarks/real.py --data FOLDER [--frames 40] [--out bench]
+
+Besides recordings, trajectories of other systems (``trajectories_evo``) are measured against their ground truth, a
+textured Gazebo world (``mesh_small_house``) is rendered as RGB-D and RGB-L, and COLMAP, where installed, gets the
+photo set with ground-truth cameras.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from common import Benchmark, print_rows, run_line, simulated
+from peers import PHOTO_SETS, PeerMissing, load
+
+from sf_bringup import measures
+from sf_bringup.eval_files import read_trajectory
+from sf_bringup.evaluation import align_trajectories, trajectory_error
+from sf_bringup.run_folder import RunFolder
+from sf_bringup.simulate import SimulationSpec
+from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.io import datasets
+from sf_interfaces.io.datasets import ReadOptions
+from sf_interfaces.types import Scale, Trajectory
+
+# Recording -> goal; what else lies in the folder is tried with the goal that suits it.
+GOALS = {"rgbd_7scenes_redkitchen_000_199": "recon", "rgbl_kitti_odometry04_000_017": "recon"}
+TRAJECTORIES = (
+    ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam.txt", "se3"),
+    ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam_drift.txt", "se3"),
+    ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-ORB_kf_mono.txt", "sim3"),
+    ("KITTI_00_gt.txt", "KITTI_00_ORB.txt", "sim3"),
+)
+
+
+def score(run: RunFolder) -> dict[str, Any]:
+    """Every measure that the recording has a reference for; the others are left out."""
+    cells: dict[str, Any] = {"line": " -> ".join(run.info()["line"])}
+    parts: tuple[Callable[[], dict[str, Any]], ...] = (
+        lambda: _trajectory(run),
+        lambda: _depth(run),
+        lambda: {"held-out MAE m": measures.measure_completion(run, 0.5).mae},
+        lambda: {"PSNR surface": measures.render_scores(measures.render_held_out(run))["psnr_surface"]},
+    )
+    for part in parts:
+        try:
+            cells |= part()
+        except SceneFactoryError:
+            continue  # the report of the run says why
+    return {**cells, "seconds": run.info()["seconds"]}
+
+
+def _trajectory(run: RunFolder) -> dict[str, Any]:
+    error = measures.measure_trajectory(run)
+    return {
+        "ATE cm": 100 * error.rmse,
+        "RPE deg": error.rpe_rotation_rmse,
+        "frames": error.pairs,
+        "path m": error.path_length,
+    }
+
+
+def _depth(run: RunFolder) -> dict[str, Any]:
+    error = measures.measure_depth(run)
+    return {"depth rel %": error.absrel, "tau %": error.inlier, "depth MAE m": error.mae}
+
+
+def recordings(data: Path) -> list[Path]:
+    """Folders that are a data set."""
+    found = []
+    for folder in sorted(p for p in data.iterdir() if p.is_dir()):
+        try:
+            datasets.recognise(folder)
+            found.append(folder)
+        except SceneFactoryError:
+            continue
+    return found
+
+
+def other_systems(folder: Path) -> list[dict[str, Any]]:
+    """Published trajectories of other systems against their ground truth."""
+    rows = []
+    for truth, estimate, alignment in TRAJECTORIES:
+        error = trajectory_error(
+            read_trajectory(folder / estimate), read_trajectory(folder / truth), alignment=alignment
+        )
+        rows.append({"estimate": estimate, "align": alignment, "ATE m": error.rmse, "RPE m": error.rpe_rmse,
+                     "RPE deg": error.rpe_rotation_rmse, "poses": error.pairs})  # fmt: skip
+    return rows
+
+
+def colmap_rows(data: Path, out: Path) -> list[dict[str, Any]]:
+    """COLMAP on the photo set with ground-truth cameras, beside this project's goal mvd on it."""
+    folder = data / "mvs_strecha_fountain_P11"
+    rows: list[dict[str, Any]] = []
+    made, missing = load(PHOTO_SETS)
+    rows += [{"system": name, "remark": why} for name, why in missing.items()]
+    for name, make in made.items():
+        try:
+            poses, focal = make().solve(folder / "images")
+        except PeerMissing as reason:
+            rows.append({"system": name, "remark": str(reason)})
+            continue
+        names = sorted(p.name for p in (folder / "images").iterdir())
+        stamps = {n: (k + 1) * 1_000_000_000 for k, n in enumerate(names)}
+        found = Trajectory.from_pairs([(stamps[n], T) for n, T in poses.items()], Scale.ARBITRARY)
+        truth = Trajectory.from_pairs([(stamps[n], _strecha(folder, n)) for n in names])
+        errors = align_trajectories(found, truth).errors
+        rows.append({"system": name, "photos": f"{len(poses)}/{len(names)}", "focal px": focal,
+                     "position error cm": 100 * float(np.sqrt((errors**2).mean()))})  # fmt: skip
+    return rows
+
+
+def _strecha(folder: Path, name: str) -> np.ndarray:
+    values = np.array((folder / "gt_dense_cameras" / f"{name}.camera").read_text().split(), float)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = values[12:21].reshape(3, 3), values[21:24]
+    return T
+
+
+def small_house(world: Path, frames: int, out: Path) -> list[tuple[str, Path]]:
+    """The Gazebo world rendered twice, exact ground truth included."""
+    size = {"frames": frames, "fps": 10.0, "width": 320, "height": 240, "focal": 240.0}
+    return [
+        ("small house, RGB-D", simulated(SimulationSpec(str(world), depth="structured_light", **size), out)[0]),
+        ("small house, RGB-L", simulated(SimulationSpec(str(world), lidar="spinning64", **size), out)[0]),
+    ]
+
+
+def main() -> None:
+    bench = Benchmark("real", __doc__.splitlines()[0])
+    bench.parser.add_argument("--data", type=Path, required=True, help="folder that holds the recordings")
+    bench.parser.add_argument("--frames", type=int, default=30, help="of each recording, from its start")
+    args = bench.parse()
+    bench.note(f"The first {args.frames} frames of each recording.")
+    inputs = [(folder.name, folder) for folder in recordings(args.data)]
+    world = args.data / "mesh_small_house" / "worlds" / "small_house.world"
+    if world.is_file():
+        inputs += small_house(world, args.frames, args.out)
+    rows: list[dict[str, Any]] = []
+    for name, source in inputs:
+        out = args.out / "real" / name.replace(", ", "-").replace(" ", "_")
+        try:
+            cells = score(run_line(source, out, GOALS.get(name, "auto"), reading=ReadOptions(limit=args.frames)))
+        except SceneFactoryError as error:
+            cells = {"remark": str(error)}
+        rows.append({"recording": name, **cells})
+        print_rows(rows[-1:])
+    tables: dict[str, list[dict[str, Any]]] = {"recordings": rows}
+    if (args.data / "trajectories_evo").is_dir():
+        tables["trajectories of other systems, as evo measures them"] = other_systems(args.data / "trajectories_evo")
+    if (args.data / "mvs_strecha_fountain_P11").is_dir():
+        tables["fountain-P11 without calibration"] = colmap_rows(args.data, args.out)
+    bench.write("Real recordings", tables)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,210 @@
+"""A live RGB-D line for a while: memory, drops and rates, as the nodes report them and as they are.
+
+    python benchmarks/soak.py [--seconds 120] [--rate 15] [--width 640] [--out soak.json]
+
+A driver process publishes a simulated walk there and back again, with sensor-data QoS; ``sf up`` builds the line.
+Prints a table and writes JSON. Exit code 1: a keyframe was lost, or a node died.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FRAMES, SAMPLE_S, WARM_S = 40, 5.0, 30.0
+FAST = ["--set", "recon.iterations=4", "--set", "recon.keyframe_pixels=8192"]
+
+
+def render(width: int, path: Path) -> None:
+    """Colour, millimetres and intrinsics of a short walk."""
+    from sf_bringup.simulate import SimulationSpec, Simulator
+
+    height, focal = width * 3 // 4, width * 0.75
+    spec = SimulationSpec(
+        "lounge", frames=FRAMES, fps=15.0, depth="exact", width=width, height=height, focal=focal, supersampling=1
+    )
+    simulator = Simulator(spec)
+    frames = [simulator.frame(i) for i in range(FRAMES)]
+    camera = spec.camera
+    np.savez(
+        path,
+        rgb=np.array([f[0] for f in frames]),
+        mm=np.array([np.nan_to_num(f[1] * 1000) for f in frames]).astype(np.uint16),
+        k=np.array([camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5]),
+    )
+
+
+def publish(path: Path, rate: float) -> None:
+    """The driver: plain rclpy until it is killed."""
+    import array
+
+    import rclpy
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import CameraInfo, Image
+
+    data = np.load(path, allow_pickle=False)
+    rclpy.init()
+    node = rclpy.create_node("soak_driver")
+    color = node.create_publisher(Image, "/soak/color/image_raw", qos_profile_sensor_data)
+    depth = node.create_publisher(Image, "/soak/depth/image_raw", qos_profile_sensor_data)
+    info = node.create_publisher(CameraInfo, "/soak/color/camera_info", qos_profile_sensor_data)
+    k, count, begin, i = data["k"], len(data["rgb"]), time.monotonic(), 0
+    images = [(color, "rgb8", data["rgb"]), (depth, "16UC1", data["mm"])]
+    while True:
+        index = i % (2 * count - 2)
+        index = index if index < count else 2 * count - 2 - index
+        calibration = CameraInfo(height=data["rgb"].shape[1], width=data["rgb"].shape[2], distortion_model="plumb_bob")
+        calibration.k = [k[0], 0.0, k[2], 0.0, k[1], k[3], 0.0, 0.0, 1.0]
+        calibration.header.stamp = node.get_clock().now().to_msg()
+        calibration.header.frame_id = "soak_optical"
+        for publisher, encoding, frames in images:
+            pixels = frames[index]
+            msg = Image(height=pixels.shape[0], width=pixels.shape[1], encoding=encoding, step=pixels.strides[0])
+            msg.header, msg.data = calibration.header, array.array("B", pixels.tobytes())
+            publisher.publish(msg)
+        info.publish(calibration)
+        i += 1
+        time.sleep(max(0.0, begin + i / rate - time.monotonic()))
+
+
+class Watch:
+    """Listens to /diagnostics and the stream states, and reads the nodes' memory."""
+
+    def __init__(self, out: Path) -> None:
+        import rclpy
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import PoseStamped
+
+        rclpy.init()
+        self._rclpy, self._out = rclpy, out
+        self._node = rclpy.create_node("soak_watch")
+        self.values: dict[str, dict[str, str]] = {}
+        self.memory: dict[str, list[tuple[float, float]]] = defaultdict(list)  # node -> (s, MB)
+        self.poses, self.first_pose = 0, 0.0
+        self._node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)
+        self._node.create_subscription(PoseStamped, "/sf/tracking/pose", self._pose, 1000)
+
+    def _report(self, msg: Any) -> None:
+        for status in msg.status:
+            self.values[status.name.rsplit("/", 1)[-1]] = {v.key: v.value for v in status.values}
+
+    def _pose(self, _: Any) -> None:
+        self.first_pose = self.first_pose or time.monotonic()
+        self.poses += 1
+
+    def run(self, seconds: float, begin: float) -> None:
+        """Listen, and look at the memory now and then."""
+        due, end = time.monotonic(), time.monotonic() + seconds
+        while time.monotonic() < end:
+            self._rclpy.spin_once(self._node, timeout_sec=0.2)
+            if time.monotonic() >= due:
+                due += SAMPLE_S
+                for name, megabytes in self._resident():
+                    self.memory[name].append((time.monotonic() - begin, megabytes))
+
+    def _resident(self) -> list[tuple[str, float]]:
+        found = []
+        for entry in Path("/proc").iterdir():
+            try:
+                words = (entry / "cmdline").read_bytes().split(b"\0") if entry.name.isdigit() else []
+                if str(self._out).encode() in b" ".join(words) and b"--params-file" in words:
+                    pages = int((entry / "statm").read_text().split()[1])
+                    module = words[words.index(b"-m") + 1].decode()
+                    found.append((module.split(".")[0].removeprefix("sf_"), pages * 4096 / 1e6))
+            except (OSError, ValueError):
+                continue
+        return found
+
+
+def summarise(watch: Watch, begin: float, seconds: float) -> dict[str, Any]:
+    """Figures of the whole soak."""
+    nodes = {}
+    for name, samples in watch.memory.items():
+        t, mb = np.array([s for s in samples if s[0] > WARM_S] or samples).T
+        slope = float(np.polyfit(t, mb, 1)[0] * 3600) if len(t) > 2 else float("nan")
+        nodes[name] = {"start_mb": float(mb[0]), "end_mb": float(mb[-1]), "mb_per_hour": slope}
+    drops = {
+        node: {k.removeprefix("dropped: "): int(v) for k, v in values.items() if k.startswith("dropped: ")}
+        for node, values in watch.values.items()
+    }
+    tracking, recon = watch.values.get("tracking", {}), watch.values.get("recon", {})
+    return {
+        "seconds": seconds,
+        "first_pose_s": watch.first_pose - begin if watch.first_pose else None,
+        "poses_heard": watch.poses,
+        "frames_tracked": int(tracking.get("frames tracked", 0)),
+        "images_received": int(tracking.get("image received", 0)),
+        "keyframes_sent": int(tracking.get("keyframes", 0)),
+        "keyframes_taken": int(recon.get("keyframes", 0)),
+        "keyframe_queue": int(recon.get("queue", 0)),
+        "points": int(recon.get("points", 0)),
+        "memory": nodes,
+        "drops": drops,
+    }
+
+
+def soak(args: argparse.Namespace) -> dict[str, Any]:
+    """Start the driver and the line, watch, end both."""
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **os.environ}
+    os.environ.update(environment)
+    with tempfile.TemporaryDirectory() as folder:
+        frames, out = Path(folder) / "frames.npz", Path(folder) / "run"
+        render(args.width, frames)
+        driver = [sys.executable, __file__, "--publish", str(frames), "--rate", str(args.rate)]
+        line = [sys.executable, "-m", "sf_bringup.cli", "up", "--goal", "recon", "--out", str(out), *FAST]
+        children = [subprocess.Popen(driver, env=environment)]
+        try:
+            watch = Watch(out)
+            watch.run(2.0, time.monotonic())
+            begin = time.monotonic()
+            children.append(subprocess.Popen(line, env=environment))
+            watch.run(args.seconds, begin)
+            result = summarise(watch, begin, args.seconds)
+            children[1].send_signal(signal.SIGINT)
+            result["exit_code"] = children[1].wait(timeout=120)
+            result["map_mb"] = (out / "map.sfmap").stat().st_size / 1e6 if (out / "map.sfmap").is_file() else 0.0
+        finally:
+            for child in children:
+                child.kill()
+    return result
+
+
+def main() -> int:
+    """Soak, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=120.0)
+    parser.add_argument("--rate", type=float, default=15.0)
+    parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--out", type=Path, default=Path("soak.json"))
+    parser.add_argument("--publish", type=Path, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.publish:
+        publish(args.publish, args.rate)
+    result = soak(args)
+    args.out.write_text(json.dumps(result, indent=2))
+    for key, value in result.items():
+        if key not in ("memory", "drops"):
+            print(f"{key:18} {value}")
+    for name, m in result["memory"].items():
+        print(f"memory {name:11} {m['start_mb']:7.0f} -> {m['end_mb']:7.0f} MB ({m['mb_per_hour']:+.0f} MB/h)")
+    for node, reasons in result["drops"].items():
+        for reason, count in reasons.items():
+            print(f"drops {node:12} {count}x {reason}")
+    lost = [r for r in result["drops"].get("recon", {}) if "keyframe dropped" in r or "never received" in r]
+    return 1 if lost or result["exit_code"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

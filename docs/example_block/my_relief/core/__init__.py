@@ -1,0 +1,3 @@
+"""The algorithm; importable without ROS."""
+
+# SPDX-License-Identifier: Apache-2.0

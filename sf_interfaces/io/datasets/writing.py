@@ -1,0 +1,162 @@
+"""A data set becomes a bag: one frame at a time, bad frames refused by name or left out and counted."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import islice
+
+from sf_interfaces import topics
+from sf_interfaces.errors import ConfigError, FormatError, SceneFactoryError
+from sf_interfaces.io.datasets.dataset import LIDAR, MAP, OPTICAL, Dataset, Sample
+from sf_interfaces.io.sequence_writer import SequenceWriter
+from sf_interfaces.types import PointCloud
+
+COLOR, INFO = "/camera/color/image_raw", "/camera/color/camera_info"
+DEPTH, POINTS = "/camera/depth/image_raw", "/lidar/points"
+TRUE_POSE = topics.GROUND_TRUTH_PREFIX + "pose"
+TRUE_DEPTH = topics.GROUND_TRUTH_PREFIX + "depth/image"
+TRUE_POINTS = topics.GROUND_TRUTH_PREFIX + "points"
+_SIZE_TOLERANCE = 0.1  # images of one set differ by a few pixels after undistortion, not by more
+_KEPT_REASONS = 20
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """How a data set is read.
+
+    Args:
+        skip_bad: leave frames out that cannot be read, and count them.
+        use_poses: poses of the data set are an input (/sf/pose) and not only a reference.
+        depth_scale: stored depth units in one metre, in place of the layout's.
+        limit: read only the first so many good frames.
+    """
+
+    skip_bad: bool = False
+    use_poses: bool = False
+    depth_scale: float | None = None
+    limit: int | None = None
+
+
+@dataclass(slots=True)
+class Written:
+    """What became of a data set: frames written and skipped, why (the first ones), notes, and what it is for."""
+
+    dataset: str
+    goal: str = "auto"
+    frames: int = 0
+    skipped: int = 0
+    reasons: list[str] = field(default_factory=list)
+    notes: tuple[str, ...] = ()
+
+    def sentences(self) -> list[str]:
+        """For the user, one line each."""
+        lines = [f"{self.dataset}: {note}" for note in self.notes]
+        if self.skipped:
+            lines.append(f"{self.skipped} bad of {self.skipped + self.frames} frames left out, the first: ")
+            lines[-1] += self.reasons[0]
+        return lines
+
+
+class _Sizes:
+    """Images of one camera have one size, those of one set nearly one."""
+
+    def __init__(self) -> None:
+        self._first: Sample | None = None
+        self._of_camera: dict[str, tuple[int, ...]] = {}
+
+    def check(self, sample: Sample) -> None:
+        """Raise a FormatError that names the image if it does not fit those before."""
+        size = sample.image.shape[:2]
+        first = self._first or sample
+        largest = max(abs(a - b) / b for a, b in zip(size, first.image.shape[:2], strict=True))
+        known = size if sample.camera is None else self._of_camera.get(sample.camera.frame_id, size)
+        if largest > _SIZE_TOLERANCE or known != size:
+            raise FormatError(
+                f"image {sample.file} is {size[1]}x{size[0]} but {first.file.name} is "
+                f"{first.image.shape[1]}x{first.image.shape[0]}; put images of other sizes in a folder of their own"
+            )
+        for depth in (sample.depth, sample.reference_depth):
+            if depth is not None and depth.z.shape != size:
+                raise FormatError(
+                    f"depth of image {sample.file} is {depth.z.shape[1]}x{depth.z.shape[0]}, the image {size[1]}x"
+                    f"{size[0]}; register depth to the image first"
+                )
+        if sample.camera is not None:
+            camera = sample.camera
+            if (camera.height, camera.width) != size:
+                raise FormatError(
+                    f"image {sample.file} is {size[1]}x{size[0]} but its calibration is for "
+                    f"{camera.width}x{camera.height}; give the images the calibration belongs to"
+                )
+            self._of_camera[camera.frame_id] = size
+        self._first = first
+
+
+def write(
+    dataset: Dataset, writer: SequenceWriter, options: ReadOptions = ReadOptions(), progress: Progress | None = None
+) -> Written:
+    """Write a data set into a bag, frame by frame.
+
+    Raises:
+        SceneFactoryError: a file is missing or malformed and ``skip_bad`` is off, or no frame is left.
+    """
+    if options.depth_scale is not None and (dataset.depth_units is None or options.depth_scale <= 0):
+        raise ConfigError(f"--depth-scale {options.depth_scale:g}: {dataset.name} has no depth it could scale")
+    # With poses given, frames need no order: whatever their poses allow can be made of them.
+    goal = "auto" if options.use_poses else dataset.goal
+    done = Written(dataset.name, goal, notes=tuple(dataset.notes()))
+    sizes = _Sizes()
+    total = len(dataset)
+    for read in dataset.samples():
+        try:
+            sample = read()
+            sizes.check(sample)
+        except SceneFactoryError as error:
+            if not options.skip_bad:
+                raise FormatError(f"{error} (--skip-bad leaves such frames out)") from error
+            done.skipped += 1
+            done.reasons += [str(error)] if len(done.reasons) < _KEPT_REASONS else []
+            continue
+        if not done.frames:
+            _write_fixed(writer, dataset, sample.stamp_ns, options.limit)
+        _write_sample(writer, sample, dataset.depth_encoding, options.use_poses)
+        done.frames += 1
+        if progress is not None:
+            progress(done.frames + done.skipped, total)
+        if done.frames == options.limit:
+            break
+    if not done.frames:
+        why = f": {done.reasons[0]}" if done.reasons else "; copy the data set again"
+        raise FormatError(f"no frame of {dataset.path} ({dataset.name}) can be used{why}")
+    return done
+
+
+def _write_fixed(writer: SequenceWriter, dataset: Dataset, stamp_ns: int, limit: int | None) -> None:
+    for parent, child, T in dataset.extrinsics():
+        writer.tf_static(parent, child, T, stamp_ns)
+    for part in islice(dataset.points(), limit):
+        writer.cloud(TRUE_POINTS, PointCloud(part.points, part.colors, stamp_ns=stamp_ns, frame_id=MAP))
+
+
+def _write_sample(writer: SequenceWriter, sample: Sample, depth_encoding: str, use_poses: bool) -> None:
+    stamp = sample.stamp_ns
+    frame = OPTICAL if sample.camera is None else sample.camera.frame_id
+    if sample.camera is not None:
+        writer.camera_info(INFO, stamp, sample.camera, sample.distortion)
+    writer.image(COLOR, stamp, sample.image, frame)
+    if sample.depth is not None:
+        depth_ns = stamp if sample.depth_ns is None else sample.depth_ns
+        writer.depth(DEPTH, depth_ns, sample.depth, frame, depth_encoding)
+    if sample.sweep is not None:
+        sweep_ns = stamp if sample.sweep_ns is None else sample.sweep_ns
+        cloud = PointCloud(sample.sweep[:, :3], stamp_ns=sweep_ns, frame_id=LIDAR)
+        writer.cloud(POINTS, cloud, sample.sweep[:, 3])
+    if sample.pose is not None:
+        for topic in (TRUE_POSE, topics.GIVEN_POSE.name) if use_poses else (TRUE_POSE,):
+            writer.pose(topic, stamp, sample.pose, MAP)
+    if sample.reference_depth is not None:
+        writer.depth(TRUE_DEPTH, stamp, sample.reference_depth, frame, "32FC1")

@@ -1,0 +1,100 @@
+"""What the nearest keyframe images show of a drawn surface: the fine detail of the light field.
+
+The colour network interpolates over a few points and averages over all keyframes. Between two keyframes their own
+images, reprojected by the drawn surface, say more. Keyframes that do not see a pixel's surface, because it is
+occluded or outside, do not count for it.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sf_interfaces.geometry import se3
+from sf_interfaces.types import Camera, Float32, Float64
+from sf_recon.core.keyframe_view import KeyframeView
+
+_TOLERANCE = 0.03  # of the depth: a surface farther from a keyframe's depth is not the one it saw
+_FEATHER = 16.0  # px over which a keyframe fades out towards its border
+_UNKNOWN = 0.1  # weight of a keyframe pixel without depth: it may show something nearer
+_ENOUGH = 0.99  # fraction of covered pixels at which no further keyframe is asked
+
+
+@dataclass(frozen=True, slots=True)
+class Detail:
+    """Mean of the keyframe images, and how far it is to be trusted."""
+
+    color: Float32  # [H, W, 3] in 0..255
+    confidence: Float32  # [H, W] 0..1: 0 where no keyframe sees the surface from a similar side
+    known: NDArray[np.bool_]  # [H, W] whether any keyframe covers the pixel
+
+
+def view_distances(T_map_camera: Float64, poses: Float64, depth: float) -> Float64:
+    """How differently the cameras at poses [N, 4, 4] look: rotation in rad plus translation in depths."""
+    cosine = (np.einsum("ij,nij->n", T_map_camera[:3, :3], poses[:, :3, :3]) - 1) / 2
+    shift = np.linalg.norm(poses[:, :3, 3] - T_map_camera[:3, 3], axis=1)
+    return np.arccos(np.clip(cosine, -1, 1)) + shift / depth
+
+
+def detail(
+    views: Sequence[KeyframeView],
+    camera: Camera,
+    T_map_camera: Float64,
+    z: Float32,
+    surface: NDArray[np.bool_],
+    *,
+    count: int,
+    reach: float,
+) -> Detail:
+    """Blend the images of the ``count`` nearest keyframes, weighted by inverse squared view distance.
+
+    Args:
+        z: [H, W] m, finite everywhere.
+        surface: [H, W]; where False, z is a guess and a keyframe is not asked whether it saw that depth.
+        reach: view distance up to which a keyframe is trusted; fully up to half of it.
+    """
+    color, total = np.zeros((*z.shape, 3), np.float32), np.zeros(z.shape, np.float32)
+    confidence = np.zeros(z.shape, np.float32)
+    distances = view_distances(T_map_camera, np.stack([v.T_map_camera for v in views]), float(np.median(z)))
+    for rank, index in enumerate(np.argsort(distances, kind="stable")[:count]):
+        trust = float(np.clip(1.5 - distances[index] / reach, 0, 1))
+        if trust == 0 or (rank > 1 and (confidence >= trust).mean() > _ENOUGH):
+            break
+        image, weight = _reproject(views[index], camera, T_map_camera, z, surface)
+        np.maximum(confidence, trust * weight, out=confidence)
+        weight *= np.float32(1 / (distances[index] ** 2 + 1e-5))
+        color += weight[..., None] * image
+        total += weight
+    return Detail(color / np.maximum(total, 1e-12)[..., None], confidence, total > 0)
+
+
+def _reproject(
+    view: KeyframeView, camera: Camera, T_map_camera: Float64, z: Float32, surface: NDArray[np.bool_]
+) -> tuple[NDArray[np.uint8], Float32]:
+    """The view's colour [H, W, 3] at each pixel's surface, and whether it saw that, faded at the border, [H, W]."""
+    T = se3.inverse(view.T_map_camera) @ T_map_camera
+    A = (view.camera.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32)
+    b = (view.camera.K @ T[:3, 3]).astype(np.float32)
+    u = np.arange(camera.width, dtype=np.float32)[None] + np.float32(0.5)
+    v = np.arange(camera.height, dtype=np.float32)[:, None] + np.float32(0.5)
+    x, y, d = (z * (A[i, 0] * u + (A[i, 1] * v + A[i, 2])) + b[i] for i in range(3))
+    ahead = d > 1e-6
+    d[~ahead] = 1.0
+    x /= d
+    y /= d
+    width, height = view.camera.width, view.camera.height
+    border = np.minimum(np.minimum(x, width - x), np.minimum(y, height - y))
+    weight: Float32 = np.clip(border / np.float32(_FEATHER), 0, 1)
+    weight *= ahead
+    x -= np.float32(0.5)  # OpenCV counts pixel centres at integers
+    y -= np.float32(0.5)
+    image = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    seen = cv2.remap(view.z, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE) * np.float32(view.step)
+    weight[surface & (np.abs(seen - d) > _TOLERANCE * d) & (seen > 0)] = 0
+    weight[seen == 0] *= np.float32(_UNKNOWN)
+    return image, weight

@@ -1,0 +1,232 @@
+"""The pose of one image against the patches of the window: search, alignment, robust pose."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sf_interfaces.geometry import se3
+from sf_interfaces.types import Camera, Float64
+from sf_tracking.config import TrackingConfig
+from sf_tracking.core.bundle import information_root, jacobians, robust, whiten
+from sf_tracking.core.keyframes import Reprojection, TrackedKeyframe, reproject
+from sf_tracking.core.update import UpdateOperator, View, search
+
+_SEARCH_SIGMA = 0.5  # px, of a position found by the search over levels
+_SEARCHED = 200  # patches searched over levels to find the motion
+_WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must not be rejected far from the truth
+_AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
+_CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
+_STILL = 1e-6  # step of the pose, m and rad, that ends the iterations
+_MEDIAN_CHI2 = 1.386  # of two degrees of freedom
+_STEPS = 6  # at most, per robust scale
+_BEHIND = 1e-3  # of the unit ray, up to which a point counts as behind the camera
+_PRIOR = np.diag([1e2] * 3 + [1e3] * 3)  # information that the prediction adds where patches see nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Sights:
+    """Patches of the window seen in one image."""
+
+    keyframe: NDArray[np.int64]  # [E] index of the keyframe in the window
+    patch: NDArray[np.int64]  # [E] index of the patch in the keyframe
+    uv: Float64  # [E, 2] px
+    information: Float64  # [E, 2, 2] 1/px^2, of the alignment alone
+
+    def __len__(self) -> int:
+        return len(self.keyframe)
+
+
+@dataclass(frozen=True, slots=True)
+class Location:
+    """The pose of an image and the sights that it rests on."""
+
+    T_cw: Float64
+    information: Float64  # [6, 6] of exp(xi) T_cw
+    excess: float  # of squared errors over what alignment claims
+    sights: Sights
+    inliers: int
+    found: float  # share of the patches looked for that were found
+    overlap: float  # share of the newest keyframe's patches that are in view and were found
+
+
+def align_sights(
+    operator: UpdateOperator,
+    target: View,
+    index: int,
+    keyframe: TrackedKeyframe,
+    at: Reprojection,
+    take: NDArray[np.int64],
+) -> Sights:
+    """Sights of the patches ``take`` of one keyframe, corrected from their reprojections."""
+    update = operator(keyframe.described.take(take), target, at.uv[take], at.warp[take])
+    ok = update.valid
+    return Sights(np.full(int(ok.sum()), index), take[ok], update.target[ok], update.information[ok])
+
+
+def join(parts: Sequence[Sights]) -> Sights:
+    """All sights of several keyframes."""
+    none = Sights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    parts = parts or [none]
+    return Sights(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("keyframe", "patch", "uv", "information")))
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """A pose and how well its patches agree with it."""
+
+    T_cw: Float64
+    error: Float64  # [E] px, reprojection errors
+    information: Float64  # [6, 6] of exp(xi) T_cw
+    excess: float  # squared errors relative to what their standard deviations say, at least 1
+
+
+def solve_pose(
+    camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64, information: Float64, scales: Sequence[float]
+) -> Solution:
+    """Robust pose of a camera from patches in the world, near ``T_cw``; Gauss-Newton.
+
+    Args:
+        X: [E, 3] scaled points, world position times inverse depth ``w`` [E].
+        uv, information: [E, 2] px and [E, 2, 2] where they were seen.
+        scales: where the robust kernel sets in, standard deviations; narrower from one to the next.
+    """
+    claimed, excess = information_root(information), 1.0
+    away, H = np.zeros(6), np.zeros((6, 6))
+    for scale in scales:
+        # Errors beyond what alignment claims (rolling shutter, depth registered badly) widen the kernel.
+        root = claimed / np.sqrt(excess)
+        for _ in range(_STEPS):
+            r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
+            white = whiten(r, root)  # [2, E]
+            weight = np.sqrt(robust((white**2).sum(axis=0), scale)[0])
+            J, _ = jacobians(camera, Xc, w, np.zeros(3), root * weight[:, None])
+            J = J.reshape(6, -1)
+            H = J @ J.T
+            step = np.linalg.solve(H + _PRIOR, J @ (white * weight).ravel() - _PRIOR @ away)
+            T_cw, away = se3.exp(step) @ T_cw, away + step
+            if np.abs(step).max() < _STILL:
+                break
+        r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
+        excess = _excess(whiten(r, claimed))
+    error = np.where(Xc[:, 2] > _BEHIND, np.linalg.norm(r, axis=1), np.inf)
+    return Solution(se3.orthonormalise(T_cw), error, H, excess)
+
+
+def _excess(white: Float64) -> float:
+    """How much larger squared errors [2, E] are than their standard deviations say, at least 1."""
+    if white.shape[1] == 0:
+        return 1.0
+    return max(1.0, float(np.median((white**2).sum(axis=0))) / _MEDIAN_CHI2)
+
+
+def _reprojection_error(camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64) -> tuple[Float64, Float64]:
+    """Residual [E, 2] px, 0 for patches behind the camera, and their scaled points [E, 3]."""
+    Xc = X @ T_cw[:3, :3].T + w[:, None] * T_cw[:3, 3]
+    behind = Xc[:, 2:] <= _BEHIND
+    Xc = np.where(behind, (0.0, 0.0, _BEHIND), Xc)
+    projected = Xc[:, :2] / Xc[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return np.where(behind, 0.0, uv - projected), Xc
+
+
+class Locator:
+    """Finds the pose of an image against the keyframes of the window."""
+
+    def __init__(self, config: TrackingConfig, operator: UpdateOperator) -> None:
+        self._config = config
+        self._operator = operator
+
+    def __call__(
+        self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, *, wide: bool
+    ) -> Location | None:
+        """Pose near ``predicted`` T_cw, or None when too few patches agree on one.
+
+        A smooth motion is predicted well enough to align at once; else the search over levels comes first.
+        """
+        if not wide:
+            found = self.align(window, view, predicted)
+            if found is not None and found.found > _CERTAIN[0] and found.inliers > _CERTAIN[1] * len(found.sights):
+                return found
+        T_cw = self._search(window, view, predicted, wide)
+        return None if T_cw is None else self.align(window, view, T_cw)
+
+    def _search(self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, wide: bool) -> Float64 | None:
+        """A first pose from the newest keyframes' patches, found over the levels of the pyramid."""
+        parts, tried = [], 0
+        for index in range(len(window) - 1, max(-1, len(window) - (4 if wide else 2)), -1):
+            keyframe = window[index]
+            at = reproject(keyframe, predicted)
+            take = _thin(np.flatnonzero(at.visible | wide), _SEARCHED)
+            start = np.where(np.isfinite(at.uv[take]), at.uv[take], keyframe.patches.uv[take])
+            uv, ok = search(self._config, keyframe.view, keyframe.patches.uv[take], view, start, wide=wide)
+            tried += len(take)
+            sigma = np.broadcast_to(np.eye(2) / _SEARCH_SIGMA**2, (int(ok.sum()), 2, 2))
+            parts.append(Sights(np.full(int(ok.sum()), index), take[ok], uv[ok], sigma))
+            if len(parts[-1]) > 0.5 * _SEARCHED:
+                break
+        sights = join(parts)
+        solved = self._pose(window, sights, predicted, (*_WIDE_SCALES, self._config.robust_sigmas))
+        agreeing = int((solved.error < 2 * self._config.inlier_px).sum())
+        enough = agreeing >= self._config.min_inliers and agreeing > _AGREEING * len(sights)
+        return solved.T_cw if enough else None
+
+    def align(
+        self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, every: bool = False
+    ) -> Location | None:
+        """Pose from aligned patches of all keyframes, from a start T_cw within about a pixel.
+
+        ``every`` aligns all visible patches, else at most ``config.edges``.
+        """
+        ats = [reproject(keyframe, T_cw) for keyframe in window]
+        owner = np.concatenate([np.full(int(at.visible.sum()), i) for i, at in enumerate(ats)])
+        patch = np.concatenate([np.flatnonzero(at.visible) for at in ats])
+        if not every:
+            chosen = _thin(np.arange(len(owner)), self._config.edges)
+            owner, patch = owner[chosen], patch[chosen]
+        parts = []
+        for index, (keyframe, at) in enumerate(zip(window, ats, strict=True)):
+            take = patch[owner == index]
+            parts.append(align_sights(self._operator, view, index, keyframe, at, take))
+        sights = join(parts)
+        scale = self._config.robust_sigmas
+        solved = self._pose(window, sights, T_cw, (3 * scale, scale, scale))
+        inliers = int((solved.error < self._config.inlier_px).sum())
+        if inliers < self._config.min_inliers or inliers < 0.3 * len(sights):
+            return None
+        newest = len(window) - 1
+        share = float((sights.keyframe == newest).sum()) / max(1, int((owner == newest).sum()))
+        overlap = share * float(ats[-1].visible.mean())
+        sights = replace(sights, information=sights.information / solved.excess)
+        return Location(
+            solved.T_cw, solved.information, solved.excess, sights, inliers, len(sights) / max(1, len(owner)), overlap
+        )
+
+    def _pose(
+        self, window: Sequence[TrackedKeyframe], sights: Sights, T_cw: Float64, scales: Sequence[float]
+    ) -> Solution:
+        """Pose from sights whose information counts the uncertain depth of their patches."""
+        X, w = np.zeros((len(sights), 3)), np.zeros(len(sights))
+        covariance = np.linalg.inv(sights.information)
+        for index, keyframe in enumerate(window):
+            mine = np.flatnonzero(sights.keyframe == index)
+            if len(mine) == 0:
+                continue
+            take = sights.patch[mine]
+            T_wc = se3.inverse(keyframe.T_cw)
+            rays = keyframe.patches.rays(keyframe.camera)[take]
+            w[mine] = keyframe.patches.w[take]
+            X[mine] = rays @ T_wc[:3, :2].T + T_wc[:3, 2] + w[mine, None] * T_wc[:3, 3]
+            J_w = reproject(keyframe, T_cw).J_w[take] * keyframe.patches.sigma[take, None]
+            covariance[mine] += J_w[:, :, None] * J_w[:, None, :]
+        return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, np.linalg.inv(covariance), scales)
+
+
+def _thin(index: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """At most ``count`` of ``index``, evenly."""
+    if len(index) <= count:
+        return index
+    return index[np.linspace(0, len(index) - 1, count).astype(np.int64)]

@@ -1,0 +1,139 @@
+"""Alignment of measured depth: point-to-plane, from one view's surface to another's.
+
+It sees what patches do not: bare walls, and the geometry between textured places.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sf_interfaces.geometry import se3
+from sf_interfaces.types import Camera, Float64, Frame
+from sf_tracking.config import TrackingConfig
+from sf_tracking.core.bundle import robust
+
+_COLUMNS = 80  # of the grid on which dense depth is compared
+_EDGE = 0.05  # relative step of depth between cells, beyond which they belong to different surfaces
+_NEIGHBOURS = 8  # sparse points that define a surface normal
+_FLAT = 0.1  # residual of that plane relative to its extent
+_POINTS = 1500  # sparse points compared at most
+_SCALE = 2.0  # of the robust kernel, standard deviations
+_MIN_POINTS = 60
+_FIRST_REACH, _REACH = 0.10, 0.03  # relative to depth: how far apart surfaces may lie, at first and at last
+_STEPS = 5
+_STILL = 1e-5
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """The surface that one view measured."""
+
+    points: Float64  # [K, 3] m, camera frame
+    normals: Float64  # [K, 3] unit, NaN where the surface is not smooth
+    grid: NDArray[np.int64] | None  # [h, w] index of the point in each cell, -1: none; None: scattered points
+    tree: cKDTree | None  # of scattered points
+    sigma: Float64  # [K] m, deviation of depth
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeFit:
+    """Relative pose of two shapes and its information."""
+
+    T: Float64  # [4, 4] T_target_source
+    information: Float64  # [6, 6] for exp(xi) T
+
+
+def shape_of(frame: Frame, config: TrackingConfig) -> Shape | None:
+    """The surface of a frame's depth, thinned; None without depth."""
+    camera = frame.camera
+    assert camera is not None
+    if frame.sparse_depth is not None and len(frame.sparse_depth) >= _MIN_POINTS:
+        step = max(1, len(frame.sparse_depth) // (2 * _POINTS))
+        points = camera.unproject(frame.sparse_depth.uv[::step], frame.sparse_depth.z[::step])
+        return _scattered(points, config.lidar_sigma)
+    if frame.depth is None:
+        return None
+    return _gridded(camera, np.where(frame.depth.valid, frame.depth.z, 0.0), config.depth_sigma)
+
+
+def _scattered(points: Float64, sigma: float) -> Shape:
+    tree = cKDTree(points)
+    near = points[tree.query(points, k=_NEIGHBOURS)[1]]
+    offset = near - near.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)
+    flat = (values[:, 0] < _FLAT**2 * values[:, 1]) & (values[:, 1] > 1e-3 * values[:, 2])
+    return Shape(points, np.where(flat[:, None], vectors[:, :, 0], np.nan), None, tree, np.full(len(points), sigma))
+
+
+def _gridded(camera: Camera, z: Float64, sigma: float) -> Shape:
+    step = max(1, round(camera.width / _COLUMNS))
+    h, w = camera.height // step, camera.width // step
+    block = z[: h * step, : w * step].reshape(h, step, w, step).astype(np.float64)
+    known = block > 0
+    count = known.sum(axis=(1, 3))
+    mean = block.sum(axis=(1, 3)) / np.maximum(count, 1)
+    extent = block.max(axis=(1, 3)) - np.where(known, block, np.inf).min(axis=(1, 3))
+    with np.errstate(invalid="ignore"):
+        good = (count > 0.6 * step * step) & (extent < _EDGE * step / 4 * mean)
+    v, u = (np.mgrid[0:h, 0:w] + 0.5) * step
+    vertices = camera.unproject(np.stack([u, v], axis=-1), np.where(good, mean, np.nan))  # [h, w, 3]
+    across, down = np.full_like(vertices, np.nan), np.full_like(vertices, np.nan)
+    across[:, 1:-1], down[1:-1] = vertices[:, 2:] - vertices[:, :-2], vertices[2:] - vertices[:-2]
+    normal = np.cross(across, down)
+    with np.errstate(invalid="ignore"):
+        normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+        smooth = (np.abs(across[..., 2]) < 2 * _EDGE * mean) & (np.abs(down[..., 2]) < 2 * _EDGE * mean)
+    normal[~smooth] = np.nan
+    index = np.where(good, np.cumsum(good).reshape(h, w) - 1, -1)
+    points = vertices[good]
+    return Shape(points, normal[good], index, None, sigma * points[:, 2] ** 2)
+
+
+def _partners(camera: Camera, target: Shape, moved: Float64) -> NDArray[np.int64]:
+    """Index of the target's point for each moved point [K, 3], -1: none."""
+    if target.tree is not None:
+        return np.asarray(target.tree.query(moved)[1])
+    assert target.grid is not None
+    h, w = target.grid.shape
+    uv, z = camera.project(moved)
+    with np.errstate(invalid="ignore"):
+        cell = np.floor(np.nan_to_num(uv) * (w / camera.width, h / camera.height)).astype(np.int64)
+    inside = (cell >= 0).all(axis=1) & (cell < (w, h)).all(axis=1) & (z > 0)
+    return np.where(inside, target.grid[np.clip(cell[:, 1], 0, h - 1), np.clip(cell[:, 0], 0, w - 1)], -1)
+
+
+def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64, trust: float) -> ShapeFit | None:
+    """Relative pose T_target_source of two shapes near ``T``, held there by ``prior``; None with too little overlap.
+
+    Args:
+        prior: [6, 6] information of ``T``, for exp(xi) T.
+        trust: share of the points that count as independent: sensors err alike in neighbouring pixels.
+    """
+    away, H = np.zeros(6), np.zeros((6, 6))
+    for step_index in range(_STEPS):
+        moved = se3.transform(T, source.points)
+        partner = _partners(camera, target, moved)
+        n, p = target.normals[partner], target.points[partner]
+        r = ((p - moved) * n).sum(axis=1)
+        reach = (_FIRST_REACH if step_index == 0 else _REACH) * moved[:, 2]
+        good = (partner >= 0) & np.isfinite(r) & (np.linalg.norm(p - moved, axis=1) < reach + 0.02 * moved[:, 2])
+        if good.sum() < _MIN_POINTS:
+            return None
+        n, r, moved = n[good], r[good], moved[good]
+        deviation = np.maximum(source.sigma[good], 1.4826 * np.median(np.abs(r)))
+        weight = robust((r / deviation) ** 2, _SCALE)[0] / deviation**2 * trust
+        J = np.concatenate([n, np.cross(moved, n)], axis=1)
+        H = (J * weight[:, None]).T @ J
+        step = np.linalg.solve(H + prior, (J * weight[:, None]).T @ r - prior @ away)
+        T, away = se3.exp(step) @ T, away + step
+        if np.abs(step).max() < _STILL:
+            break
+    return ShapeFit(se3.orthonormalise(T), H)

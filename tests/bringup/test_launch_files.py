@@ -1,0 +1,73 @@
+"""The launch file, the YAML of each mode and the RViz layout fit the program as it is."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import ast
+import sys
+import types
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import pytest
+import yaml
+
+import sf_bringup
+from sf_bringup.orchestrator import parse
+from sf_interfaces import topics
+from sf_interfaces.blocks import load_blocks
+from sf_interfaces.config import ConfigFile
+from sf_interfaces.sync import SyncConfig
+
+HERE = Path(sf_bringup.__file__).parent
+LAUNCH = HERE / "launch" / "scenefactory.launch.py"
+
+
+@pytest.fixture
+def launch_file(monkeypatch: pytest.MonkeyPatch) -> types.ModuleType:
+    """The launch file as a module; a stand-in takes the place of ``launch`` where that is not installed."""
+    pytest.importorskip("rclpy")
+    try:
+        import_module("launch")
+    except ImportError:
+        for name in ("launch", "launch.actions", "launch.substitutions"):
+            stand_in = types.ModuleType(name)
+            stand_in.__getattr__ = lambda _: object  # type: ignore[method-assign]
+            monkeypatch.setitem(sys.modules, name, stand_in)
+    spec = spec_from_file_location("scenefactory_launch", LAUNCH)
+    assert spec is not None and spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_launch_file_has_few_arguments_and_starts_what_sf_up_understands(launch_file: types.ModuleType) -> None:
+    ast.parse(LAUNCH.read_text())
+    assert len(launch_file.ARGUMENTS) <= 8 and callable(launch_file.generate_launch_description)
+    values = {name: default for name, (default, _) in launch_file.ARGUMENTS.items()}
+    given = parse(launch_file.command(values)[4:])
+    assert given.goal == "auto" and given.map == []
+    values |= {"goal": "slam", "points": "/velodyne_points", "config": str(HERE / "config" / "rgbl.yaml")}
+    given = parse(launch_file.command(values)[4:])
+    assert given.goal == "slam" and given.map == ["lidar=/velodyne_points"] and given.config.is_file()
+
+
+@pytest.mark.parametrize("path", sorted((HERE / "config").glob("*.yaml")), ids=lambda path: path.stem)
+def test_each_mode_is_a_valid_configuration(path: Path) -> None:
+    config = ConfigFile.load(path)
+    config.check_sections({spec.name for spec in load_blocks()} | {"sync", "hosts"})
+    config.build("sync", SyncConfig)
+    for section in set(config.sections) - {"sync", "hosts"}:
+        module = import_module(f"sf_{section}.config")
+        config.build(section, getattr(module, f"{section.capitalize()}Config"))
+
+
+def test_rviz_shows_topics_that_exist_with_the_quality_they_have() -> None:
+    layout = yaml.safe_load((HERE / "rviz" / "scenefactory.rviz").read_text())
+    shown = {d["Topic"]["Value"]: d["Topic"] for d in layout["Visualization Manager"]["Displays"] if "Topic" in d}
+    table = {topic.name: topic for topic in topics.TABLE}
+    assert set(shown) <= set(table)
+    for name, display in shown.items():
+        if display["Durability Policy"] == "Transient Local":
+            assert table[name].qos in (topics.Qos.LATCHED, topics.Qos.MAP, topics.Qos.KEYFRAME)
