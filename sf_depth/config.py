@@ -42,4 +42,6 @@ class DepthConfig:
     max_angle: float = option(30.0, "facing angle of a good neighbour, deg", low=1.0, high=90.0)
     min_baseline: float = option(0.03, "baseline of a good neighbour over scene depth, at least", low=0.0)
     max_baseline: float = option(0.4, "baseline of a good neighbour over scene depth, at most", low=0.0)
+    monodepth: str = option("none", "base of completion: none, structure, metric3d, depth_anything or installed")
+    monodepth_path: str = option("", "folder of its weights; empty: the user's cache (nothing is downloaded)")
     keyframe_baseline: float = option(0.06, "posed: motion over scene depth between two depth maps", low=0.0)

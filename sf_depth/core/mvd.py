@@ -29,6 +29,7 @@ _LEAST_CONTRAST = 2.0  # grey levels; below it an image is blank
 _CHECK_ROUNDS = 2  # the checks and dense BA improve each other
 _NOISY_POSES = 1.5  # given poses that leave so many times the residual of free ones are refined
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
+_FIRST_STRIDE = 2  # the first round of matching only leads to the second: a quarter of its observations suffices
 _LEAST_DENSITY = 0.01  # share of the reference's pixels that has to be triangulated
 
 
@@ -109,7 +110,8 @@ class MultiViewDepth:
         theta = None if camera is None else pinhole.theta_of(camera)
         free = self._config.intrinsics if camera is None else "none"
 
-        matched = self._match(reference, sources)
+        last = self._config.rematches == 0
+        matched = self._match(reference, sources, stride=self._config.stride * (1 if last else _FIRST_STRIDE))
         posed = theta is not None and T is not None
         at = _triangulated(matched.seen, theta, T) if theta is not None and T is not None else None
         fit = self._check_and_adjust(matched.seen, at or start(matched.seen, size, theta), size, not posed, free)
@@ -124,14 +126,18 @@ class MultiViewDepth:
         return _recovered(depth, fit, size, camera, Scale.METRIC if posed else Scale.ARBITRARY)
 
     def _match(
-        self, reference: UInt8, sources: Sequence[UInt8], guess: Sequence[Float32 | None] | None = None
+        self,
+        reference: UInt8,
+        sources: Sequence[UInt8],
+        guess: Sequence[Float32 | None] | None = None,
+        stride: int | None = None,
     ) -> _Matched:
         """Correspondences to every source that come back to where they started."""
         guesses = guess if guess is not None else [None] * len(sources)
         found = [self._matcher(reference, image, expected) for image, expected in zip(sources, guesses, strict=True)]
         weight = np.stack([checks.cross_check(one) for one in found])
         target = np.where(weight[..., None] > 0, np.stack([one.target for one in found]), np.float32(0))
-        return _Matched(target, weight, *_strided(target, weight, self._config.stride))
+        return _Matched(target, weight, *_strided(target, weight, stride or self._config.stride))
 
     def _check_and_adjust(self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str) -> _Fit:
         """Dense BA over what passes the checks; both run again with the better geometry.
@@ -270,7 +276,7 @@ def _recovered(
         )
     variance = np.where(np.isfinite(z), z**4 * solved.variance, np.nan)
     own = camera or pinhole.camera_of(at.theta, size.width, size.height)
-    focal_sigma = 0.0 if camera is not None else float(np.sqrt(adjusted.covariance[6 * len(at.T), 6 * len(at.T)]))
+    focal_sigma = 0.0 if camera is not None else dense_depth.focal_deviation(adjusted)
     return Recovered(
         DepthMap(z, variance, scale), own, at.T, registered(fit.seen), focal_sigma, adjusted.sigma, float(at.theta[4])
     )

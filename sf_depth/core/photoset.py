@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from sf_depth.config import DepthConfig
-from sf_depth.core.estimator import DepthCompleter
+from sf_depth.core.filling import Filler
 from sf_depth.core.matching import grey
 from sf_depth.core.mvd import MultiViewDepth, Recovered, check_images
 from sf_depth.core.scale import from_translations
@@ -55,7 +55,7 @@ class PhotoSetDepth:
     def __init__(self, config: DepthConfig) -> None:
         self._config = config
         self._mvd = MultiViewDepth(config)
-        self._completer = DepthCompleter(config)
+        self._filler = Filler(config)
 
     def estimate(self, frames: Sequence[Frame]) -> PhotoSet:
         """Depth, pose and, where missing, intrinsics of all images that can be registered.
@@ -85,7 +85,7 @@ class PhotoSetDepth:
 
     def complete(self, keyframe: Keyframe) -> Keyframe:
         """Fill the pixels that were not triangulated."""
-        return self._completer.complete(keyframe)
+        return self._filler.fill(keyframe)
 
     @property
     def max_sources(self) -> int:

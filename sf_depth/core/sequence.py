@@ -14,6 +14,7 @@ import numpy as np
 
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
+from sf_depth.core.filling import Filler
 from sf_depth.core.mvd import MultiViewDepth
 from sf_depth.core.neighbors import NeighborLimits, before_and_after
 from sf_depth.core.overlap import sighted_depth
@@ -129,7 +130,7 @@ class SequenceDepth:
     def __init__(self, config: DepthConfig, setting: Setting) -> None:
         self._config, self._setting = config, setting
         self._mvd = MultiViewDepth(config)
-        self._completer = DepthCompleter(config)
+        self._filler = Filler(config)
         self._limits = NeighborLimits(config.max_angle, config.min_baseline, config.max_baseline)
         self._frames: list[Keyframe] = []
         self._next = 0  # index of the first frame that was not yet considered
@@ -174,7 +175,7 @@ class SequenceDepth:
             return self._skip("too few good neighbours: the camera hardly moves, or turns too fast")
         try:
             depth = self._setting.recover(self._mvd, frame, [self._frames[j] for j in chosen])
-            dense = self._completer.complete(replace(frame, depth=depth))
+            dense = self._filler.fill(replace(frame, depth=depth))
         except SceneFactoryError as error:
             return self._skip(str(error))
         self._last = frame

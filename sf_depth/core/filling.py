@@ -1,0 +1,52 @@
+"""From triangulated to complete depth: a monocular base where there is a model, ScaleCov for its scale."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from sf_depth.config import DepthConfig
+from sf_depth.core.estimator import DepthCompleter
+from sf_depth.core.monodepth import MonoDepth, load_monodepth
+from sf_interfaces.types import DepthMap, Keyframe
+
+# Relative deviation for every image width of distance from triangulated depth: another surface may be there,
+# which no interpolation of what was seen can know.
+_UNSEEN = 1.0
+
+
+class Filler:
+    """Completes keyframes whose depth has gaps.
+
+    Args:
+        config: see :class:`DepthConfig`; ``monodepth`` names the base.
+
+    Raises:
+        ConfigError: that model is not installed.
+    """
+
+    def __init__(self, config: DepthConfig) -> None:
+        self._completer = DepthCompleter(config)
+        self._model: MonoDepth | None = None
+        if config.monodepth != "none":
+            self._model = load_monodepth(config.monodepth, config.monodepth_path)
+
+    def fill(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe with depth and variance at every pixel.
+
+        Raises:
+            FormatError: it has too little depth to start from.
+        """
+        seen = keyframe.depth
+        base = None
+        if self._model is not None:
+            guessed = self._model(keyframe.image, keyframe.camera, seen).z
+            base = np.nan_to_num(guessed, nan=float(np.nanmedian(guessed)))
+        full = self._completer.complete(keyframe, base)
+        assert full.depth is not None and full.depth.variance is not None and seen is not None
+        away = cv2.distanceTransform((~seen.valid).astype(np.uint8), cv2.DIST_L2, 3) / keyframe.camera.width
+        variance = full.depth.variance + (_UNSEEN * away * full.depth.z) ** 2
+        return replace(full, depth=DepthMap(full.depth.z, variance, full.depth.scale))
