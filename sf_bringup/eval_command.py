@@ -117,9 +117,9 @@ def _completion(args: argparse.Namespace) -> dict[str, Any]:
 def _mesh(args: argparse.Namespace) -> dict[str, Any]:
     from sf_bringup.eval_files import read_surface, read_trajectory
     from sf_bringup.evaluation.mesh import icp, surface_error
-    from sf_bringup.inputs import read_camera
     from sf_bringup.measures import measure_mesh
     from sf_bringup.run_folder import RunFolder
+    from sf_interfaces.io.calibration import read_camera
 
     if (args.poses is None) != (args.calibration is None):
         raise ConfigError("NICE culling needs both --poses and --calibration: the views and their camera")
@@ -133,7 +133,7 @@ def _mesh(args: argparse.Namespace) -> dict[str, Any]:
         found = found.moved(icp(found, truth))
     out = {"nicer_unculled": surface_error(found, truth).as_dict()}
     if args.poses is not None:
-        views = (read_camera(args.calibration), read_trajectory(args.poses).poses)
+        views = (read_camera(args.calibration)[0], read_trajectory(args.poses).poses)
         out = {"nice_culled": surface_error(found, truth, views).as_dict(), **out}
     return out
 
