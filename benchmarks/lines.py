@@ -27,7 +27,7 @@ from sf_interfaces.io.trajectory import read_tum
 
 COLOR, INFO = "/camera/color/image_raw", "/camera/color/camera_info"
 DEPTH, LIDAR, POSE = "/camera/depth/image_raw", "/lidar/points", "/ground_truth/pose"
-FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.keyframe_pixels=16384"]
+FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8"]
 
 
 @dataclass(frozen=True, slots=True)

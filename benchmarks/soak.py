@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 FRAMES, SAMPLE_S, WARM_S = 40, 5.0, 30.0
-FAST = ["--set", "recon.iterations=4", "--set", "recon.keyframe_pixels=8192"]
+FAST = ["--set", "recon.iterations=4"]
 
 
 def render(width: int, path: Path) -> None:

@@ -205,7 +205,7 @@ def test_damaged_configurations(tmp_path: Path) -> None:
 
 
 def test_damaged_maps(tmp_path: Path) -> None:
-    small = ReconConfig(iterations=1, final_iterations=1, keyframe_pixels=64, threads=1)
+    small = ReconConfig(iterations=1, final_iterations=1, threads=1)
     reconstruction = Reconstruction(small)
     image = RNG.integers(0, 256, (24, 32, 3), dtype=np.uint8)
     camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
