@@ -16,7 +16,7 @@ from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.native import native
 
 BETAS = (0.9, 0.99)
-EPSILON = 1e-15
+EPSILON = 1e-3  # about the gradient of one grey level: smaller ones are noise, which Adam must not blow up
 JUMP_FACTOR = 10.0
 BLIND = 4  # every so many pixels learns the colour seen from no side, which the exported surface shows
 _HALF_MAX, _HALF_MIN = 6e4, 1e-7  # range of the moments, which are kept in half precision

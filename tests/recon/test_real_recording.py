@@ -52,5 +52,6 @@ def test_held_out_view_between_two_keyframes(shared_data: Callable[[str], Path])
     hit = drawn.depth.valid
     assert room.resolution == 0.005
     assert drawn.hole_fraction < 0.25
-    assert psnr(drawn.image[hit], truth.image[hit]) > 21.5
+    assert psnr(drawn.image[hit], truth.image[hit]) > 24
+    assert psnr(drawn.image, truth.image) > 22  # holes included
     assert np.nanmedian(np.abs(drawn.depth.z - truth.depth.z)) < 0.02
