@@ -41,7 +41,7 @@ def test_photos_become_depth_poses_camera_cloud_and_contact_sheet(tmp_path: Path
     views = room(3)
     run(RunRequest((photos(tmp_path / "photos.mcap", views),), "mvd", out=tmp_path / "out"))
     folder = RunFolder.open(tmp_path / "out")
-    assert abs(folder.camera().fx / views.camera.fx - 1) < 0.01
+    assert abs(folder.camera().fx / views.camera.fx - 1) < 0.03  # three small views; more in tests/depth
     assert len(read_tum(folder.path / "trajectory.tum")) == 3
     maps = [depth for _, depth in folder.depth_maps()]
     assert len(maps) == 3 and all(depth.density == 1.0 and depth.variance is not None for depth in maps)
