@@ -4,18 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from sf_bringup.evaluation import trajectory_error
-from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.lidar import project_sweep
-from sf_interfaces.io.datasets import SevenScenes, read_kitti_calibration, register_depth
-from sf_interfaces.io.trajectory import read_kitti
-from sf_interfaces.types import DepthMap, Float64, Frame, Trajectory
+from sf_interfaces.io.datasets import SevenScenes
+from sf_interfaces.io.datasets.kitti import KittiOdometry
+from sf_interfaces.types import Float64, Frame, Trajectory
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.tracker import Tracker
 
@@ -30,28 +29,21 @@ def folder(name: str) -> Path:
 
 def kitchen(root: Path, stride: int) -> Iterator[tuple[Frame, Float64]]:
     """Registered RGB-D frames and reference poses of the colour camera."""
-    camera, move = SevenScenes.COLOR_CAMERA, SevenScenes.T_COLOR_DEPTH
-    for i in range(0, 200, stride):
-        stem = root / f"frame-{i:06d}"
-        raw = cv2.imread(f"{stem}.depth.png", cv2.IMREAD_UNCHANGED)
-        depth = DepthMap(np.where((raw == 0) | (raw == 65535), np.nan, raw * 1e-3))
-        depth = register_depth(depth, SevenScenes.DEPTH_CAMERA, camera, move)
-        T = se3.orthonormalise(np.loadtxt(f"{stem}.pose.txt")) @ se3.inverse(move)
-        image = np.ascontiguousarray(cv2.imread(f"{stem}.color.jpg")[..., ::-1])
-        yield Frame(10**12 + round(i * 1e9 / 30), camera, image, depth), T
+    for read in islice(SevenScenes(root).samples(), None, None, stride):
+        sample = read()
+        assert sample.pose is not None
+        yield Frame(sample.stamp_ns, sample.camera, sample.image, sample.depth), sample.pose
 
 
 def street(root: Path) -> Iterator[tuple[Frame, Float64]]:
     """RGB-L frames and reference poses of the left colour camera."""
-    sequence, poses = root / "sequences" / "04", read_kitti(root / "poses" / "04.txt").poses
-    seconds = np.loadtxt(sequence / "times.txt")
-    for i, file in enumerate(sorted((sequence / "image_2").glob("*.png"))):
-        image = np.ascontiguousarray(cv2.imread(str(file))[..., ::-1])
-        camera, T_cl, T_cc0 = read_kitti_calibration(sequence / "calib.txt", image.shape[1], image.shape[0])
-        points = np.fromfile(sequence / "velodyne" / f"{file.stem}.bin", "<f4").reshape(-1, 4)[:, :3]
-        stamp = 10**12 + round(float(seconds[i]) * 1e9)
-        T = T_cc0 @ poses[i] @ se3.inverse(T_cc0)
-        yield Frame(stamp, camera, image, sparse_depth=project_sweep(points, camera, T_cl)), T
+    recording = KittiOdometry(root)
+    ((_, _, T_camera_lidar),) = recording.extrinsics()
+    for read in recording.samples():
+        sample = read()
+        assert sample.camera is not None and sample.sweep is not None and sample.pose is not None
+        sparse = project_sweep(sample.sweep[:, :3], sample.camera, T_camera_lidar)
+        yield Frame(sample.stamp_ns, sample.camera, sample.image, sparse_depth=sparse), sample.pose
 
 
 def error_of(frames: Iterator[tuple[Frame, Float64]]) -> float:
