@@ -99,13 +99,15 @@ class Line:
         for transition, reached in _TRANSITIONS:
             request = ChangeState.Request(transition=Transition(id=transition))
             deadline = time.monotonic() + _TRANSITION_S
-            # A request can overtake the discovery of the way back, and its answer is then lost: look, and ask again.
-            while (answer := self._call(name, "change_state", ChangeState, request)) is None:
-                if self._state(name) == reached:
-                    break
+            answer = self._call(name, "change_state", ChangeState, request)
+            # The request can overtake the discovery of the way back, and its answer is then lost; or the node is busy
+            # with it, and silent. Only a node that answers and has not moved is asked again.
+            while answer is None and (state := self._state(name)) != reached:
                 if time.monotonic() > deadline:
                     log = self._running[name].process.log
                     raise SceneFactoryError(f"node {name} does not answer its lifecycle services; see {log}")
+                if state is not None:
+                    answer = self._call(name, "change_state", ChangeState, request)
             if answer is not None and not answer.success and self._state(name) != reached:
                 said = self._running[name].process.last_lines(3)
                 raise ConfigError(f"node {name} refused to start: {said}")

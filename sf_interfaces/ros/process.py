@@ -12,6 +12,7 @@ from collections.abc import Callable
 from types import FrameType
 
 import rclpy
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
@@ -59,7 +60,10 @@ def run(make: Callable[[], BlockNode], args: list[str] | None = None) -> int:
         if node.exit_code is None:
             node.trigger_activate()
     while not stopping and node.exit_code is None and os.getppid() == parent:
-        executor.spin_once(timeout_sec=_SPIN_S)
+        try:
+            executor.spin_once(timeout_sec=_SPIN_S)
+        except RCLError as error:  # a lifecycle request that does not fit the state, such as one asked twice
+            node.get_logger().warning(str(error))
     code = node.exit_code or 0
     if not _finished(node, stopping):
         sys.stderr.flush()
