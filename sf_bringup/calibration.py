@@ -16,6 +16,7 @@ from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
 from sf_interfaces.blocks import Quantity
 from sf_interfaces.config import ConfigFile
+from sf_interfaces.errors import CalibrationError, SceneFactoryError
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.ros.messages import decode_image, to_ns
 from sf_interfaces.types import Camera, UInt8
@@ -35,15 +36,20 @@ def calibrate(given: BagInput, config: ConfigFile) -> Camera:
     """Intrinsics from as many of the first images as they take.
 
     Raises:
-        InsufficientParallax: the images do not constrain them.
+        CalibrationError: the images do not constrain them.
     """
     part = make_part(CALIBRATE, config)
     camera: Camera | None = None
-    for _, image in bag_images(given):
-        camera = part.add(image)
-        if camera is not None:
-            break
-    camera = camera or part.finish()
+    try:
+        for _, image in bag_images(given):
+            camera = part.add(image)
+            if camera is not None:
+                break
+        camera = camera or part.finish()
+    except SceneFactoryError as error:
+        raise CalibrationError(
+            f"{given.bag} has no camera_info, and {CALIBRATE} cannot do without: {error}; add camera_info or --calibration"
+        ) from error
     return replace(camera, frame_id=given.frames["rgb"])
 
 

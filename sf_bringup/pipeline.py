@@ -24,7 +24,7 @@ from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import sync_values
 from sf_interfaces.blocks import BlockSpec, Quantity, load_blocks
 from sf_interfaces.config import ConfigFile, build
-from sf_interfaces.errors import ConfigError, FormatError
+from sf_interfaces.errors import ConfigError, FormatError, TrackingLost
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import write_tum
@@ -192,6 +192,11 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
         if not done:
             raise _unused(given, inputs)
         line.finish()
+        if line.tracker is not None and not len(line.tracker.trajectory()):
+            raise TrackingLost(
+                f"none of the {done} frames of {given.bag} could be tracked: it takes texture and, without depth, "
+                "a camera that moves sideways; give such images, depth, or --poses"
+            )
         _save(folder, line, writer)
     return dict(inputs.assembler.reasons) | line.reasons
 

@@ -52,7 +52,8 @@ def test_surface_lies_on_the_walls(room: Reconstruction) -> None:
 
 
 def test_training_lowers_the_error(room: Reconstruction) -> None:
-    assert np.mean(room.losses[-20:]) < 0.2 * np.mean(room.losses[:3])
+    """Points start at the observed colour: what is left to learn is what averaging lost."""
+    assert np.mean(room.losses[-20:]) < 0.5 * np.mean(room.losses[:3])
 
 
 def test_first_view_shows_its_colours_before_any_training() -> None:
