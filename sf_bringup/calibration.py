@@ -48,7 +48,8 @@ def calibrate(given: BagInput, config: ConfigFile) -> Camera:
         camera = camera or part.finish()
     except SceneFactoryError as error:
         raise CalibrationError(
-            f"{given.bag} has no camera_info, and {CALIBRATE} cannot do without: {error}; add camera_info or --calibration"
+            f"{given.bag} has no camera_info, and {CALIBRATE} cannot estimate it: {error}; "
+            "add camera_info or --calibration"
         ) from error
     return replace(camera, frame_id=given.frames["rgb"])
 

@@ -62,9 +62,17 @@ def _trajectory_panel(axis: Any, estimate: Float64, reference: Float64 | None) -
     axis.set_title("trajectory")
 
 
-def overview(sample: Sample) -> Figure:
-    """Input, depth, its standard deviation and a rendered view of one keyframe."""
-    figure, axes = plt.subplots(2, 2, figsize=(13, 8), constrained_layout=True)
+def overview(sample: Sample, estimate: Float64 | None, reference: Float64 | None) -> Figure:
+    """Input, depth, its standard deviation and a rendered view of one keyframe, and the way of the camera.
+
+    Args:
+        estimate, reference: positions [N, 3] and [M, 3] in m, aligned; None where unknown.
+    """
+    figure = plt.figure(figsize=(17, 8), constrained_layout=True)
+    grid = figure.add_gridspec(2, 3)
+    axes = np.array([[figure.add_subplot(grid[row, column]) for column in (0, 1)] for row in (0, 1)])
+    if estimate is not None:
+        _trajectory_panel(figure.add_subplot(grid[:, 2]), estimate, reference)
     _image_panel(axes[0, 0], sample.image, "input image" + (" and LiDAR points" if sample.sparse else ""))
     if sample.sparse is not None:
         row, col = np.nonzero(sample.sparse.valid)

@@ -171,7 +171,7 @@ def run_figures(run: RunFolder) -> dict[str, Figure]:
     out = {}
     sample, pair = _or_reason(lambda: _last_keyframe_sample(run)), _or_reason(lambda: _aligned(run))
     if isinstance(sample, figures.Sample):
-        out["overview"] = figures.overview(sample)
+        out["overview"] = figures.overview(sample, *_ways(run, pair))
     if isinstance(pair, AlignedTrajectories):
         out["trajectory"] = figures.trajectory_figure(pair)
     depth = _or_reason(lambda: [(found, truth) for _, found, truth in measures.depth_pairs(run)])
@@ -186,6 +186,14 @@ def run_figures(run: RunFolder) -> dict[str, Figure]:
         if calls:
             out["rate and latency"] = figures.timing_figure(calls)
     return out
+
+
+def _ways(run: RunFolder, pair: AlignedTrajectories | str) -> tuple[Float64 | None, Float64 | None]:
+    """Positions of the camera as estimated and, where the input has a reference, as they were."""
+    if isinstance(pair, AlignedTrajectories):
+        return pair.estimate[:, :3, 3], pair.reference[:, :3, 3]
+    own = _or_reason(run.trajectory)
+    return (None if isinstance(own, str) else own.positions), None
 
 
 def _aligned(run: RunFolder) -> AlignedTrajectories:
