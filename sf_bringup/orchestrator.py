@@ -31,7 +31,7 @@ from sf_interfaces.ros.qos import qos_profile
 HOSTS = "hosts"  # section of the configuration: node -> host that runs it with --only
 _LOOK_S = 0.25  # between two looks at the graph
 _SETTLE_S = 1.0  # topics must have stayed the same this long before the line is planned anew
-_SAVE_S = 60.0  # at the end, for the map and the trajectory to be written
+_SAVE_S = 1.5  # at the end, for results to be written: with SIGTERM after it, all are gone within three seconds
 _GONE_S = 30.0  # an input of the running line may be silent this long (a driver restarts) before the line changes
 
 
@@ -46,6 +46,7 @@ class Orchestrator(Node):
         replay: nodes drop nothing (a lossless player feeds the line).
         use: blocks preferred whatever their cost.
         only: nodes to run on this host; empty: all that ``hosts`` of the configuration does not place elsewhere.
+        save_s: how long nodes may take at the end to write their results.
 
     Raises:
         ConfigError: an unknown section or node name.
@@ -61,11 +62,12 @@ class Orchestrator(Node):
         replay: bool = False,
         use: Sequence[str] = (),
         only: Sequence[str] = (),
+        save_s: float = _SAVE_S,
     ) -> None:
         super().__init__("_".join(["sf_orchestrator", *only]))
         config.check_sections({spec.name for spec in load_blocks()} | {"sync", HOSTS})
         self._goal, self._user, self._config, self._folder, self._replay = goal, user, config, folder, replay
-        self._use, self._only = tuple(use), frozenset(only)
+        self._use, self._only, self._save_s = tuple(use), frozenset(only), save_s
         self._elsewhere = frozenset(config.sections.get(HOSTS, {})) - self._only
         self._inputs: frozenset[str] = frozenset()  # topics the running line takes in
         self._last_seen: dict[str, tuple[str, float]] = {}
@@ -101,7 +103,7 @@ class Orchestrator(Node):
 
     def stop(self) -> None:
         """End all nodes, when they have written their results."""
-        self._line.stop(_SAVE_S)
+        self._line.stop(self._save_s)
 
     # ---- inside
 
@@ -226,6 +228,12 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="NODE", help="run only these nodes of the line on this host"
     )
+    parser.add_argument(
+        "--save-s",
+        type=float,
+        default=_SAVE_S,
+        help="seconds the nodes may take after Ctrl-C to write their results (large maps take more than the default)",
+    )
     parser.add_argument("--replay", action="store_true", help="drop nothing: a lossless player feeds the line")
     return parser.parse_args(args)
 
@@ -258,7 +266,7 @@ def main(args: Sequence[str] | None = None) -> int:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = Orchestrator(
             given.goal, _pairs(given.map, "--map"), config, given.out,
-            replay=given.replay, use=given.use, only=given.only,
+            replay=given.replay, use=given.use, only=given.only, save_s=given.save_s,
         )  # fmt: skip
         try:
             while not stopping:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import queue
+import signal
 import struct
 import sys
 import threading
@@ -132,8 +133,8 @@ def prefetch(messages: Iterator[RawMessage], size: int = 64) -> Iterator[RawMess
 class Player:
     """The node that plays. ``run`` returns how many messages went out per topic."""
 
-    def __init__(self, node: Any, executor: Any, bag: BagReader, options: PlayOptions):
-        self._node, self._executor, self._bag, self._options = node, executor, bag, options
+    def __init__(self, node: Any, executor: Any, bag: BagReader, options: PlayOptions, stop: threading.Event):
+        self._node, self._executor, self._bag, self._options, self._stop = node, executor, bag, options, stop
         self._names = dict(options.remap)
         self._head = choose_head(bag, options)
         self._credits = Credits(options.consumed)
@@ -185,7 +186,13 @@ class Player:
         kind = rclpy_factory("builtin_interfaces/msg/Time")
         self._node.create_subscription(kind, topic, lambda msg: self._credits.consumed(topic, to_ns(msg)), 1000)
 
+    def _check_stop(self) -> None:
+        """End here when asked to. Raised by the signal itself, it would be lost inside a callback of DDS."""
+        if self._stop.is_set():
+            raise KeyboardInterrupt
+
     def _spin(self, seconds: float) -> None:
+        self._check_stop()
         self._executor.spin_once(timeout_sec=max(0.0, seconds))
 
     def wait_for_subscribers(self) -> None:
@@ -219,6 +226,7 @@ class Player:
         """Sleep until a log time is due, while the clock goes on."""
         rate = self._options.rate or (None if self._options.lossless else 1.0)
         while rate is not None:
+            self._check_stop()
             elapsed = int((time.monotonic() - start_wall) * rate * 1e9)
             if start_ns + elapsed >= stamp_ns:
                 break
@@ -243,6 +251,7 @@ class Player:
     def _play_once(self, counts: Counter[str]) -> None:
         start_wall, start_ns = time.monotonic(), None
         for message in prefetch(self._bag.messages(list(self._publishers))):
+            self._check_stop()
             start_ns = message.stamp_ns if start_ns is None else start_ns
             self._pace(message.stamp_ns, start_ns, start_wall)
             if message.topic == self._head:
@@ -298,10 +307,17 @@ def parse(args: list[str] | None) -> PlayOptions:
 
 
 def play(options: PlayOptions) -> Counter[str]:
-    """Play a bag in a node of its own; counts per bag topic."""
+    """Play a bag in a node of its own; counts per bag topic.
+
+    Raises:
+        KeyboardInterrupt: SIGINT came, and this is the main thread.
+    """
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
+    stop = threading.Event()
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, lambda *_: stop.set())
     with BagReader(options.bag) as bag:
         context = rclpy.Context()
         rclpy.init(context=context)
@@ -309,7 +325,7 @@ def play(options: PlayOptions) -> Counter[str]:
             node = rclpy.create_node("player", namespace="/sf", context=context)
             executor = SingleThreadedExecutor(context=context)
             executor.add_node(node)
-            return Player(node, executor, bag, options).run()
+            return Player(node, executor, bag, options, stop).run()
         finally:
             rclpy.try_shutdown(context=context)
 

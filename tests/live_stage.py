@@ -71,7 +71,7 @@ class Stage:
         return self.spawn(str(DRIVER), str(self.frames), namespace, "--rate", "8", "--log", self.stamps, *more)
 
     def up(self, *more: str) -> subprocess.Popen[bytes]:
-        return self.spawn("-m", "sf_bringup.cli", "up", "--out", str(self.out), *FAST, *more)
+        return self.spawn("-m", "sf_bringup.cli", "up", "--out", str(self.out), "--save-s", "60", *FAST, *more)
 
     @property
     def log(self) -> str:
