@@ -69,14 +69,21 @@ class RunFolder:
         Raises:
             FormatError: the line of this run had no tracker.
         """
-        path = self.path / "trajectory.tum"
+        return self._estimated("trajectory.tum")
+
+    def keyframes(self) -> Trajectory:
+        """Final pose of every keyframe, T_map_camera.
+
+        Raises:
+            FormatError: the line of this run had no tracker.
+        """
+        return self._estimated("keyframes.tum")
+
+    def _estimated(self, name: str) -> Trajectory:
+        path = self.path / name
         if not path.is_file():
             raise FormatError(f"{path} is missing: this run estimated no poses")
         return read_tum(path, self.scale)
-
-    def keyframes(self) -> Trajectory:
-        """Final pose of every keyframe, T_map_camera."""
-        return read_tum(self.path / "keyframes.tum", self.scale)
 
     def keyframe_poses(self) -> Trajectory:
         """T_map_camera of every keyframe, estimated or given.
