@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -15,6 +14,7 @@ from sf_interfaces import topics
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry.undistort import Distortion
 from sf_interfaces.io import datasets
+from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.io.bag import BagReader, RawMessage, is_bag
 from sf_interfaces.io.datasets import ReadOptions, Written
 from sf_interfaces.io.sequence_writer import SequenceWriter
@@ -35,7 +35,11 @@ def convert(dataset: Path, out: Path, options: ReadOptions) -> tuple[Written, di
     if out.suffix != ".mcap":
         raise FormatError(f"cannot write {out}: the bag must end in .mcap")
     recognised = datasets.recognise(dataset, options.depth_scale)
-    with _whole(out) as unfinished, SequenceWriter(unfinished) as writer, Progress("reading", "frames") as progress:
+    with (
+        replace_file(out) as unfinished,
+        SequenceWriter(unfinished) as writer,
+        Progress("reading", "frames") as progress,
+    ):
         written = datasets.write(recognised, writer, options, progress.update)
     with BagReader(out) as reader:
         return written, {name: info.count for name, info in sorted(reader.topics.items())}
@@ -102,7 +106,7 @@ def with_given(
         return bag
     target = out / "input_with_given.mcap"
     info_topic = image_topic.rsplit("/", 1)[0] + "/camera_info"
-    with _whole(target) as unfinished, BagReader(bag) as reader, SequenceWriter(unfinished) as writer:
+    with replace_file(target) as unfinished, BagReader(bag) as reader, SequenceWriter(unfinished) as writer:
         if extrinsic is not None:
             writer.tf_static(*extrinsic, stamp_ns=reader.start_ns)
         if poses is not None:
@@ -117,17 +121,6 @@ def with_given(
                 own = _of_stream(camera, reader.decode(raw), bag)
                 writer.camera_info(info_topic, raw.stamp_ns, own, distortion)
     return target
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Where to write a file that gets its name only when it is whole (and may replace the one being read)."""
-    unfinished = path.with_name(f"{path.stem}.unfinished{path.suffix}")
-    try:
-        yield unfinished
-        unfinished.rename(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
 
 
 def _messages(reader: BagReader, limit: int | None) -> Iterator[RawMessage]:

@@ -13,15 +13,7 @@ from sf_interfaces.errors import ConfigError
 from sf_recon.config import ReconConfig
 from sf_recon.core import mesh
 from sf_recon.core.reconstruction import Reconstruction
-from tests.recon.scene import HALF, texture, view
-
-
-@pytest.fixture(scope="module")
-def room() -> Reconstruction:
-    out = Reconstruction(ReconConfig(pixels=1024, iterations=5))
-    for i in range(0, 8, 2):
-        out.add(view(i))
-    return out
+from tests.recon.scene import HALF, texture
 
 
 def off_wall(points: np.ndarray) -> np.ndarray:

@@ -17,21 +17,12 @@ import cv2
 import numpy as np
 import pytest
 
-from sf_recon.config import ReconConfig
 from sf_recon.core.reconstruction import Reconstruction
 from sf_recon.core.viewer import LAYERS, Viewer, picture
 from tests.recon.scene import CAMERA, view
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 pytest.importorskip("viser")
-
-
-@pytest.fixture(scope="module")
-def room() -> Reconstruction:
-    out = Reconstruction(ReconConfig(pixels=1024, iterations=5))
-    for i in range(0, 8, 2):
-        out.add(view(i))
-    return out
 
 
 def test_every_layer_is_a_picture(room: Reconstruction) -> None:
