@@ -1,6 +1,6 @@
 """An independent camera: plain rclpy, sensor-data QoS, RGB-D from a bag, raw or compressed. Imports nothing of ours.
 
-python live_camera.py FRAMES.npz NAMESPACE [--compressed] [--rate HZ] [--seconds S] [--change-after N]
+python live_camera.py FRAMES.npz NAMESPACE [--compressed] [--rate HZ] [--seconds S] [--log FILE]
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -74,14 +74,14 @@ def main() -> None:
             ]
         else:
             sent = [(color, fill(Image(), rgb[index], "rgb8")), (depth, fill(Image(), mm[index], "16UC1"))]
+        if args.log:  # before it is sent, so that a frame which arrived is known even if this process is stopped here
+            stamp = calibrated.header.stamp
+            with open(args.log, "a") as log:
+                log.write(f"{stamp.sec * 1_000_000_000 + stamp.nanosec} {index}\n")
         for publisher, msg in sent:
             msg.header = calibrated.header
             publisher.publish(msg)
         info.publish(calibrated)
-        if args.log:
-            stamp = calibrated.header.stamp
-            with open(args.log, "a") as log:
-                log.write(f"{stamp.sec * 1_000_000_000 + stamp.nanosec} {index}\n")
         i += 1
         rclpy.spin_once(node, timeout_sec=0)
         time.sleep(max(0.0, begin + i / args.rate - time.monotonic()))
