@@ -8,6 +8,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +98,7 @@ def _plan(args: argparse.Namespace) -> int:
 def _convert(args: argparse.Namespace) -> int:
     from sf_bringup.inputs import convert
 
-    written, counts = convert(args.dataset, args.out, _reading(args))
+    written, counts = convert(args.dataset, args.out, replace(_reading(args), limit=args.limit))
     value = {
         "out": str(args.out),
         "dataset": written.dataset,
@@ -215,6 +216,7 @@ def _add_reading(parser: argparse.ArgumentParser) -> None:
 def _add_convert(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("out", type=Path)
+    parser.add_argument("--limit", type=int, metavar="N", help="only the first so many frames")
     _add_reading(parser)
 
 

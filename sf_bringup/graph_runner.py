@@ -24,6 +24,7 @@ from sf_bringup.progress import Progress
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import NodeLaunch, launches
 from sf_interfaces import topics
+from sf_interfaces.blocks import Quantity
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.ros import messages
@@ -112,7 +113,7 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
         graph = Line(node, logs, environment)
         helpers: list[Process] = []
         try:
-            recorder = Process("recorder", _record_command(folder), logs / "recorder.log", environment)
+            recorder = Process("recorder", _record_command(folder, made), logs / "recorder.log", environment)
             helpers.append(recorder)
             graph.apply(line)
             player = Process("player", _play_command(given, line, rate), logs / "player.log", environment)
@@ -127,14 +128,16 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
     return {}
 
 
-def _record_command(folder: RunFolder) -> list[str]:
+def _record_command(folder: RunFolder, made: Plan) -> list[str]:
     run = folder.path
     calibration = run / "calibration.json"
     info = folder.info()
     calibration.write_text(json.dumps({"frames": json.dumps(info["frames"]), "topics": json.dumps(info["topics"])}))
     recorded = [*_RECORDED, *_ALSO_RECORDED]
     recorded += [topics.stream(block.split(":")[0]).name for block in info["line"]]
-    attached = [str(run / name) for name in ("config.yaml", "trajectory.tum", "keyframes.tum")]
+    tracked = any(Quantity.POSE in step.spec.provides for step in made.steps)
+    names = ("config.yaml", "trajectory.tum", "keyframes.tum") if tracked else ("config.yaml",)
+    attached = [str(run / name) for name in names]
     return [
         sys.executable, "-m", "sf_bringup.recorder", str(folder.result), "--topics", *recorded,
         "--attach", *attached, "--metadata", f"scenefactory={run / 'run.json'}", f"calibration={calibration}",

@@ -175,13 +175,13 @@ def measure_completion(run: RunFolder, holdout: float, seed: int = 0) -> DepthEr
     Raises:
         FormatError: the run has no sparse keyframe depth.
     """
-    from sf_bringup.pipeline import make_completer
+    from sf_bringup.pipeline import make_part
     from sf_interfaces.config import ConfigFile
     from sf_interfaces.types import Keyframe
 
     if not 0.0 < holdout < 1.0:
         raise FormatError(f"--holdout must lie strictly between 0 and 1, got {holdout}")
-    completer = make_completer(ConfigFile.load(run.path / "config.yaml"))
+    completer = make_part("depth:complete", ConfigFile.load(run.path / "config.yaml")).completer
     camera, poses = run.camera(), run.keyframes()
     stamps = {int(s) for s in poses.stamps_ns}
     images = dict(decoded(run.result, topics.KEYFRAME_IMAGE.name, decode_image, stamps))

@@ -13,8 +13,6 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from sf_bringup import photo_set
 from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
@@ -48,11 +46,6 @@ def make_part(block_id: str, config: ConfigFile) -> Any:
     raise ConfigError(f"no installed package provides a runnable '{block_id}'; see 'sf blocks'")
 
 
-def make_completer(config: ConfigFile) -> Any:
-    """The depth completer, for measuring it on held-out points."""
-    return make_part("depth:complete", config)
-
-
 def load_map(path: Path) -> Any:
     """The reconstruction saved in an ``.sfmap`` file, ready to render."""
     return make_part("recon", ConfigFile({})).load(path)
@@ -67,22 +60,22 @@ class ProductionLine:
         self._flexion = parts.get(owner.get(Quantity.IMAGE, ""))
         self._tracker_id = owner.get(Quantity.POSE, "")
         self.tracker = parts.get(self._tracker_id)
-        self._completer = parts.get("depth:complete")
+        self._depth = parts.get(owner.get(Quantity.DEPTH, ""))
         self._posed_depth = "depth:posed" in blocks
-        self._sequence = parts.get("depth:slam") or parts.get("depth:posed")
         self.reconstruction = parts.get("recon")
         self._writer, self._config, self._epoch = writer, config, 0
         self.timings = Timings()
         writer.posed = self.tracker is not None or posed
         self.keyframe_poses: list[tuple[int, Float64]] = []
+        self.completed = 0  # keyframes that got dense depth
 
     def in_epoch(self, epoch: int) -> None:
         """A backward jump of time ends one sequence and begins another: the tracker starts anew."""
         if self.tracker is not None and epoch != self._epoch:
             self._finish_keyframes(self.tracker.finish().keyframes)
             self.tracker = make_part(self._tracker_id, self._config)
-        if self._sequence is not None and epoch != self._epoch:
-            self._densified(self._sequence.finish())
+        if self._depth is not None and epoch != self._epoch:
+            self._completed(self._depth.finish())
         self._epoch = epoch
 
     def step(self, frame: Frame) -> Float64 | None:
@@ -102,11 +95,7 @@ class ProductionLine:
             self._finish_keyframes(update.keyframes)
             return update.T_map_camera if update.scale is Scale.METRIC else None
         if frame.image is not None and frame.camera is not None:
-            # Completion of single frames needs no pose; such keyframes stay in their own optical frame.
-            T = np.eye(4) if frame.T_map_camera is None else frame.T_map_camera
-            sparse = frame.sparse_depth
-            depth = frame.depth if sparse is None else sparse.to_map(frame.camera.height, frame.camera.width)
-            keyframe = Keyframe(frame.stamp_ns, frame.camera, frame.image, T, depth)
+            keyframe = Keyframe.of(frame)
             if not self._posed_depth:
                 self._writer.keyframe(keyframe)
             self._complete(keyframe)
@@ -116,8 +105,8 @@ class ProductionLine:
         """End of the input: the tracker's window becomes final, the colour field gets its last sweeps."""
         if self.tracker is not None:
             self._finish_keyframes(self.tracker.finish().keyframes)
-        if self._sequence is not None:
-            self._densified(self._sequence.finish())
+        if self._depth is not None:
+            self._completed(self._depth.finish())
         if self.reconstruction is not None:
             self.reconstruction.finish()
 
@@ -128,28 +117,30 @@ class ProductionLine:
             self._complete(keyframe)
 
     @property
+    def lacks_depth(self) -> bool:
+        """Whether depth was all that this line had to complete, and none came of it."""
+        return self._depth is not None and self.tracker is None and not self.completed
+
+    @property
     def reasons(self) -> dict[str, int]:
         """Why keyframes got no depth, with counts."""
-        return {} if self._sequence is None else dict(self._sequence.reasons)
+        return {} if self._depth is None else dict(self._depth.reasons)
 
     def _complete(self, keyframe: Keyframe) -> None:
-        if self._sequence is not None:
-            with self.timings.measure("depth"):
-                dense = self._sequence.add(keyframe)
-            self._densified(dense)
+        if self._depth is None:
+            self._reconstruct(keyframe)
             return
-        if self._completer is not None:
-            with self.timings.measure("depth"):
-                keyframe = self._completer.complete(keyframe)
-            self._writer.dense(keyframe)
-        self._reconstruct(keyframe)
+        with self.timings.measure("depth"):
+            dense = self._depth.add(keyframe)
+        self._completed(dense)
 
-    def _densified(self, keyframes: Sequence[Keyframe]) -> None:
-        """Keyframes that multi-view depth has given depth to, some frames after they came."""
+    def _completed(self, keyframes: Sequence[Keyframe]) -> None:
+        """Keyframes that have dense depth now; multi-view depth gives it some frames after they came."""
         for keyframe in keyframes:
             if self._posed_depth:
                 self._writer.keyframe(replace(keyframe, depth=None))
             self._writer.dense(keyframe)
+            self.completed += 1
             self._reconstruct(keyframe)
 
     def _reconstruct(self, keyframe: Keyframe) -> None:
@@ -192,6 +183,8 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
         if not done:
             raise _unused(given, inputs)
         line.finish()
+        if line.lacks_depth:
+            raise FormatError(f"no frame of {given.bag} got depth: {'; '.join(line.reasons) or 'nothing was measured'}")
         if line.tracker is not None and not len(line.tracker.trajectory()):
             raise TrackingLost(
                 f"none of the {done} frames of {given.bag} could be tracked: it takes texture and, without depth, "

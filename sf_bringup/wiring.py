@@ -77,10 +77,6 @@ def launches(
     first = plan.steps[0]
     if first.spec.id == "depth:mvd":
         raise PlanError("an image set is estimated at once, in one process: leave --engine ros out")
-    if first.spec.name == "depth" and Q.POSE not in plan.available:
-        raise PlanError(
-            "single frames without poses are completed in one process: leave --engine ros out, or use --goal recon"
-        )
     streams = [_STREAM[role] for role in roles if role in compressed]
     return tuple(_launch(plan, step, roles, config, lossless, out, streams) for step in plan.steps)
 

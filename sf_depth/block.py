@@ -11,7 +11,6 @@ from sf_interfaces.config import ConfigFile
 if TYPE_CHECKING:
     from sf_depth.config import DepthConfig
     from sf_depth.core.calibrate import Calibrator
-    from sf_depth.core.estimator import DepthCompleter
     from sf_depth.core.photoset import PhotoSetDepth
     from sf_depth.core.sequence import SequenceDepth
 
@@ -69,11 +68,12 @@ MVD = BlockSpec(
 SPECS = (COMPLETE, POSED, SLAM, CALIBRATE, MVD)
 
 
-def make(config: ConfigFile) -> DepthCompleter:
+def make(config: ConfigFile) -> EachDepth:
     """The completer of mode ``complete``, configured by section ``depth``."""
     from sf_depth.core.estimator import DepthCompleter
+    from sf_depth.core.sequence import EachDepth
 
-    return DepthCompleter(config.build("depth", _config_class()))
+    return EachDepth(DepthCompleter(config.build("depth", _config_class())))
 
 
 def make_slam(config: ConfigFile) -> SequenceDepth:

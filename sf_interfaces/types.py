@@ -276,6 +276,20 @@ class Keyframe:
         _set(self, "image", _check_image(self.image, self.camera))
         _set(self, "T_map_camera", check_pose(self.T_map_camera, "T_map_camera"))
 
+    @staticmethod
+    def of(frame: Frame) -> Keyframe:
+        """A sensor frame whose pose is final because it was given; without one it stays in its own optical frame.
+
+        Raises:
+            FormatError: the frame has no image or no camera.
+        """
+        camera, sparse = frame.camera, frame.sparse_depth
+        if frame.image is None or camera is None:
+            raise FormatError(f"frame {frame.stamp_ns} has no image or no camera_info; a keyframe needs both")
+        T = np.eye(4) if frame.T_map_camera is None else frame.T_map_camera
+        depth = frame.depth if sparse is None else sparse.to_map(camera.height, camera.width)
+        return Keyframe(frame.stamp_ns, camera, frame.image, T, depth)
+
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:

@@ -19,17 +19,18 @@ from mcap.reader import make_reader
 from sf_bringup.simulate import SimulationSpec, simulate
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.trajectory import read_tum
+from sf_interfaces.ros.messages import decode_depth, to_ns
 
 pytestmark = [pytest.mark.graph, pytest.mark.timeout(900)]
 FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.pixels=1024"]
+SIZE = {"width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
 _domains = iter(range(40, 90))
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("graph") / "rgbl.mcap"
-    size = {"width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
-    simulate(SimulationSpec("lounge", frames=16, fps=10.0, lidar="spinning64", **size), path)
+    simulate(SimulationSpec("lounge", frames=16, fps=10.0, lidar="spinning64", **SIZE), path)
     return path
 
 
@@ -112,6 +113,24 @@ def test_rgbl_graph_records_everything_for_every_keyframe(
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["trajectory"]["rmse"] < 0.03 and summary["depth"]["absrel"] < 8
     assert gone(str(tmp_path), 3.0)
+
+
+@pytest.mark.parametrize("words", [["--use-poses", "--goal", "recon"], ["--goal", "completion"]])
+def test_lines_without_a_tracker_are_equal_too(words: list[str], environment: dict[str, str], tmp_path: Path) -> None:
+    dense, bag = [], tmp_path / "short.mcap"
+    simulate(SimulationSpec("lounge", frames=5, fps=10.0, lidar="spinning64", **SIZE), bag)
+    for engine in ("inproc", "ros"):
+        out = tmp_path / engine
+        done = sf(environment, "run", str(bag), *words, "--engine", engine, "--out", str(out), *FAST)
+        assert done.returncode == 0, done.stderr
+        with BagReader(out / "result.mcap") as result:
+            kinds = [f"/sf/depth/dense/{part}" for part in ("image", "variance")]
+            found = [(raw.topic, result.decode(raw)) for raw in result.messages(kinds)]
+            dense.append({(topic, to_ns(msg.header.stamp)): decode_depth(msg).z for topic, msg in found})
+            assert ("/sf/depth/dense/pose" in result.topics) == ("recon" in words)
+    assert dense[0].keys() == dense[1].keys() and len(dense[0]) == 2 * 5
+    for key, z in dense[0].items():
+        np.testing.assert_allclose(dense[1][key], z, rtol=1e-5)
 
 
 def test_ctrl_c_ends_everything_and_keeps_the_recording(bag: Path, environment: dict[str, str], tmp_path: Path) -> None:

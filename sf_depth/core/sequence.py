@@ -26,6 +26,7 @@ from sf_interfaces.types import DepthMap, Float64, Keyframe
 _AHEAD = 6  # later frames a keyframe waits for
 _KEPT = 24  # frames that may still become neighbours
 _LEAST_NEIGHBORS = 2  # tau_nb of the paper
+_NOTHING_MEASURED = "keyframe without measured depth, as between the sweeps of a LiDAR"
 
 
 class Setting(Protocol):
@@ -102,12 +103,15 @@ class EachDepth:
     """Completes keyframes one by one, as they come (mode ``complete``)."""
 
     def __init__(self, completer: DepthCompleter) -> None:
-        self._completer = completer
+        self.completer = completer
         self.reasons: dict[str, int] = {}
 
     def add(self, frame: Keyframe) -> list[Keyframe]:
-        """The keyframe with dense depth."""
-        return [self._completer.complete(frame)]
+        """The keyframe with dense depth; none where nothing was measured, as between the sweeps of a LiDAR."""
+        if frame.depth is None or not frame.depth.valid.any():
+            self.reasons[_NOTHING_MEASURED] = self.reasons.get(_NOTHING_MEASURED, 0) + 1
+            return []
+        return [self.completer.complete(frame)]
 
     def finish(self) -> list[Keyframe]:
         """Nothing waits."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 from sf_interfaces.errors import ConfigError
@@ -13,11 +12,14 @@ from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.ros.bundles import COMPLETED, TRACKED, BundleInputs
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.sensors import SensorInputs
-from sf_interfaces.types import Frame, Keyframe
+from sf_interfaces.types import Keyframe
 
 
 class KeyframeSource:
-    """Keyframes by the node option ``source``: ``tracking``, ``depth``, or ``sensors`` with given poses.
+    """Keyframes by the node option ``source``: ``tracking``, ``depth``, or ``sensors`` with poses given or none.
+
+    Attributes:
+        posed: False where the sensors' frames come without a pose, each in its own optical frame.
 
     Raises:
         ConfigError: another source.
@@ -25,11 +27,12 @@ class KeyframeSource:
 
     def __init__(self, node: BlockNode, *, landmarks: bool) -> None:
         self._sensors: SensorInputs | None = None
+        self.posed = True
         self._done = _Progress(node)
         source = node.options.source
         if source == "sensors":
-            # As the head of its line the node needs the pose from outside.
-            sync = replace(node.sync_config(), pose=True)
+            sync = node.sync_config()
+            self.posed = sync.pose
             self._sensors = SensorInputs(sync, lossless=node.options.lossless)
             for topic, kind, keep in self._sensors.subscriptions():
                 node.listen(topic, kind, keep)
@@ -55,7 +58,7 @@ class KeyframeSource:
                 yield keyframe
             return
         self._sensors.push(kind, msg)
-        yield from map(_posed, self._sensors.assembler.ready())
+        yield from map(Keyframe.of, self._sensors.assembler.ready())
 
     def end(self) -> Iterator[Keyframe]:
         """The keyframes that were still waiting when the input ended."""
@@ -63,7 +66,7 @@ class KeyframeSource:
             self._bundles.joiner.end()
             return
         self._sensors.assembler.end()
-        yield from map(_posed, self._sensors.assembler.ready())
+        yield from map(Keyframe.of, self._sensors.assembler.ready())
 
     def done(self, stamp_ns: int) -> None:
         """Everything up to this keyframe is dealt with and safe: a successor of this process need not repeat it."""
@@ -93,11 +96,3 @@ class _Progress:
         if self._path is not None:
             with replace_file(self._path) as draft:
                 draft.write_text(json.dumps({"stamp_ns": stamp_ns}))
-
-
-def _posed(frame: Frame) -> Keyframe:
-    """Every frame with a given pose is a keyframe: its pose is final."""
-    assert frame.camera is not None and frame.image is not None and frame.T_map_camera is not None
-    sparse = frame.sparse_depth
-    depth = frame.depth if sparse is None else sparse.to_map(frame.camera.height, frame.camera.width)
-    return Keyframe(frame.stamp_ns, frame.camera, frame.image, frame.T_map_camera, depth)

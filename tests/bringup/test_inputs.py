@@ -165,6 +165,9 @@ def test_plan_reads_only_the_first_frames(tmp_path: Path, capsys: pytest.Capture
     assert main(["convert", str(tmp_path / "o.mcap"), str(tmp_path / "p.mcap")]) == 2
     assert "must end in .mcap" in (err := capsys.readouterr().err) and "a bag already" in err
     assert (said["frames"], said["skipped"]) == (5, 1) and "40." in said["reasons"][0]
+    assert main(["convert", str(folder), str(tmp_path / "q.mcap"), "--limit", "3", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == 3
+    assert main(["convert", str(folder), str(tmp_path / "r.mcap"), "--limit", "0"]) == 2
 
 
 def test_frames_without_order_get_the_goal_that_suits_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -33,12 +33,19 @@ class ReadOptions:
         use_poses: poses of the data set are an input (/sf/pose) and not only a reference.
         depth_scale: stored depth units in one metre, in place of the layout's.
         limit: read only the first so many good frames.
+
+    Raises:
+        ConfigError: a limit below one frame.
     """
 
     skip_bad: bool = False
     use_poses: bool = False
     depth_scale: float | None = None
     limit: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.limit is not None and self.limit < 1:
+            raise ConfigError(f"a limit of {self.limit} frames leaves nothing to read; give 1 or more")
 
 
 @dataclass(slots=True)
