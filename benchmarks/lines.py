@@ -1,10 +1,11 @@
-"""All production lines in both engines on one simulated recording: line x engine x result.
+"""All production lines in both engines, on a simulated recording and on real ones: line x data x engine x result.
 
-    python benchmarks/lines.py [--work DIR] [--frames 24] [--only NAME ...] [--out lines.json] [--markdown lines.md]
+    python benchmarks/lines.py [--data FOLDER] [--work DIR] [--frames 24] [--only NAME ...] [--markdown lines.md]
 
-One RGB-D and LiDAR recording is simulated; each line gets a copy that holds nothing but its own inputs (and the
-references), so the line is derived from the topics alone. Equality is the largest difference of positions between the
-engines. A line that this version cannot run is a row with the sentence it ends with.
+One RGB-D and LiDAR recording is simulated, real ones are read from ``--data``; each line gets a copy that holds nothing
+but its own inputs (and the references), so the line is derived from the topics alone. Equality is the largest
+difference of positions between the engines. A line that this version cannot run is a row with the sentence it ends
+with.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -15,15 +16,20 @@ import json
 import subprocess
 import sys
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sf_bringup.eval_files import read_surface
+from sf_bringup.inputs import convert
 from sf_bringup.simulate import SimulationSpec, simulate
 from sf_interfaces.io.bag import BagReader
+from sf_interfaces.io.datasets import ReadOptions
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
+from sf_interfaces.types import Float64
 
 COLOR, INFO = "/camera/color/image_raw", "/camera/color/camera_info"
 DEPTH, LIDAR, POSE = "/camera/depth/image_raw", "/lidar/points", "/ground_truth/pose"
@@ -57,6 +63,31 @@ LINES = (
 )
 
 
+# Name in the table -> folder below --data; each line runs on those that have what it needs.
+REAL = {"7-Scenes": "rgbd_7scenes_redkitchen_000_199", "KITTI odometry": "rgbl_kitti_odometry04_000_017"}
+
+
+def recordings(work: Path, data: Path | None, frames: int) -> dict[str, Path]:
+    """Name -> bag of everything there is to run on; what an earlier call left in ``work`` is used again."""
+    bags = {"simulated": work / "simulated.mcap"}
+    if not bags["simulated"].is_file():
+        size = {"width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
+        spec = SimulationSpec("lounge", frames=frames, fps=15.0, depth="exact", lidar="spinning64", **size)
+        simulate(spec, bags["simulated"])
+    for name, folder in REAL.items() if data is not None else ():
+        assert data is not None
+        bags[name] = work / f"{folder}.mcap"
+        if not bags[name].is_file():
+            convert(data / folder, bags[name], ReadOptions(limit=frames))
+    return bags
+
+
+def suits(bag: Path, line: Line) -> bool:
+    """Whether a recording holds what a line takes in."""
+    with BagReader(bag) as reader:
+        return all(topic in reader.topics for topic in (*line.topics, POSE))
+
+
 def derive(whole: Path, line: Line, target: Path) -> Path:
     """A bag with the inputs of a line, the references, and the static transforms."""
     depth_only = COLOR not in line.topics
@@ -79,19 +110,29 @@ def run(bag: Path, line: Line, engine: str, out: Path) -> dict[str, Any]:
     if done.returncode:
         return {**row, "said": done.stderr.strip().splitlines()[-1] if done.stderr.strip() else ""}
     summary = json.loads((out / "summary.json").read_text())
-    measures = {key: summary[key] for key in ("trajectory", "depth", "render") if isinstance(summary.get(key), dict)}
-    return {**row, "blocks": summary["line"], "seconds": summary["seconds"], **measures}
+    kinds = ("trajectory", "depth", "completion", "render")
+    measures = {key: summary[key] for key in kinds if isinstance(summary.get(key), dict)}
+    surface = out / "surface.ply"
+    points = len(read_surface(surface).points) if surface.is_file() else None
+    return {**row, "blocks": summary["line"], "seconds": summary["seconds"], "points": points, **measures}
+
+
+def geometry(folder: Path) -> Float64 | None:
+    """What a run has estimated, [N, D] m: its positions, else its surface, else its depth."""
+    if (folder / "trajectory.tum").is_file():
+        return read_tum(folder / "trajectory.tum").positions
+    if (folder / "surface.ply").is_file():
+        return np.asarray(read_surface(folder / "surface.ply").points, np.float64)
+    maps = [np.load(path)["z"].reshape(-1, 1) for path in sorted((folder / "depth").glob("*.npz"))]
+    return np.concatenate(maps).astype(np.float64) if maps else None
 
 
 def difference(first: Path, second: Path) -> float | None:
-    """Largest distance between the positions of two runs, m."""
-    paths = [folder / "trajectory.tum" for folder in (first, second)]
-    if not all(path.is_file() for path in paths):
+    """Largest distance between what two runs have estimated, m; infinite where they differ in number."""
+    a, b = geometry(first), geometry(second)
+    if a is None or b is None:
         return None
-    a, b = map(read_tum, paths)
-    if not np.array_equal(a.stamps_ns, b.stamps_ns):
-        return float("inf")
-    return float(np.linalg.norm(a.positions - b.positions, axis=1).max())
+    return float(np.nanmax(np.linalg.norm(a - b, axis=1))) if a.shape == b.shape else float("inf")
 
 
 def result(row: dict[str, Any]) -> str:
@@ -103,6 +144,10 @@ def result(row: dict[str, Any]) -> str:
         parts.append(f"ATE {row['trajectory']['rmse'] * 100:.2f} cm")
     if "depth" in row:
         parts.append(f"absrel {row['depth']['absrel']:.2f} %")
+    if "completion" in row:
+        parts.append(f"held-out LiDAR MAE {row['completion']['mae']:.3f} m")
+    if row.get("points"):
+        parts.append(f"{row['points'] / 1e3:.0f} k points")
     if "render" in row:
         parts.append(f"PSNR {row['render']['psnr_surface']:.1f} dB")
     return ", ".join(parts) or "done"
@@ -111,14 +156,15 @@ def result(row: dict[str, Any]) -> str:
 def table(rows: list[dict[str, Any]]) -> str:
     """All rows as Markdown."""
     lines = [
-        "| line | engine | blocks | result | engines differ by | command |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| line | data | engine | blocks | result | seconds | engines differ by | command |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for row in rows:
         apart = row.get("apart")
         differ = "" if apart is None else f"{apart:.1e} m"
         blocks = " -> ".join(row.get("blocks", [])) or "-"
-        lines.append(f"| {row['line']} | {row['engine']} | {blocks} | {result(row)} | {differ} | `{row['command']}` |")
+        cells = [row["line"], row["data"], row["engine"], blocks, result(row), f"{row.get('seconds', 0):.0f}", differ]
+        lines.append(f"| {' | '.join(cells)} | `{row['command']}` |")
     return "\n".join(lines)
 
 
@@ -126,31 +172,27 @@ def main() -> None:
     """Simulate, run, tell."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("out/lines"))
+    parser.add_argument("--data", type=Path, help="folder that holds the real recordings")
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--only", nargs="+", default=[], help="names of lines, see LINES")
     parser.add_argument("--out", type=Path, default=Path("lines.json"))
     parser.add_argument("--markdown", type=Path)
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
-    whole = args.work / "whole.mcap"
-    if not whole.is_file():
-        size = {"width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
-        simulate(
-            SimulationSpec("lounge", frames=args.frames, fps=15.0, depth="exact", lidar="spinning64", **size), whole
-        )
+    bags = recordings(args.work, args.data, args.frames)
     rows: list[dict[str, Any]] = []
-    for index, line in enumerate(LINES):
-        if args.only and line.name not in args.only:
+    for line, (data, whole) in product(LINES, bags.items()):
+        if (args.only and line.name not in args.only) or not suits(whole, line):
             continue
-        bag = derive(whole, line, args.work / f"{index:02}.mcap")
-        outs = {engine: args.work / f"{index:02}_{engine}" for engine in ("inproc", "ros")}
-        made = [run(bag, line, engine, out) for engine, out in outs.items()]
+        stem = f"{LINES.index(line) + 1:02}-{data.split()[0].lower()}"
+        bag = derive(whole, line, args.work / f"{stem}.mcap")
+        outs = {engine: args.work / f"{stem}-{engine}" for engine in ("inproc", "ros")}
+        made = [{"data": data, **run(bag, line, engine, out)} for engine, out in outs.items()]
         made[1]["apart"] = difference(*outs.values())
         rows += made
         for row in made:
-            print(
-                f"{line.name:34} {row['engine']:7} {' -> '.join(row.get('blocks', ['-'])):44} {result(row)}", flush=True
-            )
+            blocks = " -> ".join(row.get("blocks", ["-"]))
+            print(f"{line.name:32} {data:15} {row['engine']:7} {blocks:44} {result(row)}", flush=True)
         args.out.write_text(json.dumps(rows, indent=2))
     if args.markdown:
         args.markdown.write_text(table(rows) + "\n")

@@ -31,6 +31,7 @@ from sf_interfaces.ros import messages
 from sf_interfaces.ros.qos import qos_profile
 
 _FINISHED = 1  # sf_interfaces/msg/StreamState
+_DISCOVERY_S = 60.0
 _IN_FLIGHT = 24  # images: more than one LiDAR period at 30 Hz, little enough to bound memory
 _RECORDED = [t.name for t in topics.TABLE if t.name.startswith("/sf/") and t not in topics.INPUTS]
 _ALSO_RECORDED = [topics.TF.name, topics.TF_STATIC.name, topics.DIAGNOSTICS.name]
@@ -152,6 +153,8 @@ def _play_command(given: BagInput, line: tuple[NodeLaunch, ...], rate: float) ->
     if rate:
         return [*command, "--rate", str(rate)]
     heads = [topics.consumed(launch.name).name for launch in line if launch.head]
+    # The nodes are active already: only discovery is still to come, which takes long where cores are scarce.
+    command += ["--wait", f"{_DISCOVERY_S:g}"]
     return [*command, "--lossless", "--in-flight", str(_IN_FLIGHT), "--consumed", *heads]
 
 

@@ -69,15 +69,17 @@ def reference_trajectory(bag: Path) -> Trajectory | None:
     return _poses(bag, GROUND_TRUTH_POSE)
 
 
-def decoded(bag: Path, topic: str, decode: Callable[[Any], Any], stamps: set[int]) -> Iterator[tuple[int, Any]]:
-    """(stamp, decoded message) of one topic, only for header stamps in ``stamps``."""
+def decoded(
+    bag: Path, topic: str, decode: Callable[[Any], Any], stamps: set[int] | None = None
+) -> Iterator[tuple[int, Any]]:
+    """(stamp, decoded message) of one topic; with ``stamps`` only for those header stamps."""
     with BagReader(bag) as reader:
         if topic not in reader.topics:
             return
         for raw in reader.messages([topic]):
             message = reader.decode(raw)
             stamp = to_ns(message.header.stamp)
-            if stamp in stamps:
+            if stamps is None or stamp in stamps:
                 yield stamp, decode(message)
 
 
@@ -182,12 +184,11 @@ def measure_completion(run: RunFolder, holdout: float, seed: int = 0) -> DepthEr
     if not 0.0 < holdout < 1.0:
         raise FormatError(f"--holdout must lie strictly between 0 and 1, got {holdout}")
     completer = make_part("depth:complete", ConfigFile.load(run.path / "config.yaml")).completer
-    camera, poses = run.camera(), run.keyframes()
-    stamps = {int(s) for s in poses.stamps_ns}
-    images = dict(decoded(run.result, topics.KEYFRAME_IMAGE.name, decode_image, stamps))
+    camera = run.camera()
+    images = dict(decoded(run.result, topics.KEYFRAME_IMAGE.name, decode_image))
     rng = np.random.default_rng(seed)
     errors = []
-    for stamp, depth in decoded(run.result, topics.KEYFRAME_DEPTH.name, decode_depth, stamps):
+    for stamp, depth in decoded(run.result, topics.KEYFRAME_DEPTH.name, decode_depth):
         if depth.density > DENSE_FRACTION:
             break
         row, col = np.nonzero(depth.valid)
@@ -227,21 +228,40 @@ def measure_mesh(run: RunFolder, reference: Path, with_icp: bool = False) -> dic
 
 def held_out_stamps(run: RunFolder) -> list[int]:
     """Evenly spread frames that are not keyframes: the colour field has never seen them."""
-    known = {int(s) for s in run.keyframes().stamps_ns}
+    known = {int(s) for s in run.keyframe_poses().stamps_ns}
     first, last = (min(known), max(known)) if known else (0, 0)
-    free = [int(s) for s in run.trajectory().stamps_ns if int(s) not in known and first < int(s) < last]
+    free = [int(s) for s in frame_poses(run).stamps_ns if int(s) not in known and first < int(s) < last]
     step = max(1, len(free) // HELD_OUT_VIEWS)
     return free[::step][:HELD_OUT_VIEWS]
 
 
+def frame_poses(run: RunFolder) -> Trajectory:
+    """T_map_camera of every frame, estimated or given.
+
+    Raises:
+        FormatError: neither, or the given poses are of another frame than the camera's.
+    """
+    topic = run.info()["topics"].get("pose")
+    if (run.path / "trajectory.tum").is_file() or topic is None:
+        return run.trajectory()
+    given, known = _poses(input_bag(run), topic), run.keyframe_poses()
+    at = {} if given is None else dict(zip(given.stamps_ns.tolist(), given.poses, strict=True))
+    if given is None or any(
+        not np.allclose(at.get(stamp, T), T, atol=1e-6)
+        for stamp, T in zip(known.stamps_ns.tolist(), known.poses, strict=True)
+    ):
+        raise FormatError(f"{topic} does not give the poses of the camera itself; frames cannot be drawn there")
+    return given
+
+
 def render_held_out(run: RunFolder) -> list[HeldOutView]:
-    """Interpolated views: frames between keyframes, drawn at their estimated poses."""
+    """Interpolated views: frames between keyframes, drawn at their estimated or given poses."""
     topic = run.info()["topics"].get("rgb")
     stamps = held_out_stamps(run)
     if not stamps or topic is None:
         return []
-    trajectory = run.trajectory()
-    return _render(run, topic, dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)), set(stamps))
+    poses = frame_poses(run)
+    return _render(run, topic, dict(zip(poses.stamps_ns.tolist(), poses.poses, strict=True)), set(stamps))
 
 
 def render_novel(run: RunFolder) -> list[HeldOutView]:

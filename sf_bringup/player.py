@@ -198,6 +198,8 @@ class Player:
     def wait_for_subscribers(self) -> None:
         """Until the head topic (any topic, where there is none) has a subscriber and matching has settled.
 
+        Lossless also waits to see who gives the credits: on a busy machine they are discovered seconds later.
+
         Raises:
             ConfigError: lossless, and nobody came.
         """
@@ -205,14 +207,16 @@ class Player:
         deadline, last, since = time.monotonic() + self._options.wait_s, None, time.monotonic()
         while time.monotonic() < deadline:
             counts = [p.get_subscription_count() for p in self._publishers.values()]
-            counts += [self._node.count_publishers(topic) for topic in self._options.consumed]
-            if counts != last:
-                last, since = counts, time.monotonic()
+            credits = [self._node.count_publishers(topic) for topic in self._options.consumed]
+            if counts + credits != last:
+                last, since = counts + credits, time.monotonic()
             there = head.get_subscription_count() if head is not None else sum(counts)
-            if there and time.monotonic() - since > _SETTLE_S:
+            if there and all(credits) and time.monotonic() - since > _SETTLE_S:
                 return
             self._spin(0.05)
-        words = f"nobody subscribed to {self._head or 'any topic'} within {self._options.wait_s:g} s"
+        missing = [f"published on {t}" for t in self._options.consumed if not self._node.count_publishers(t)]
+        wanted = missing[0] if missing else f"subscribed to {self._head or 'any topic'}"
+        words = f"nobody {wanted} within {self._options.wait_s:g} s"
         if self._options.lossless:
             raise ConfigError(f"{words}; start the consumer first, or raise --wait")
         print(f"player: {words}; playing all the same", file=sys.stderr, flush=True)

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sf_depth.config import DepthConfig
     from sf_depth.core.calibrate import Calibrator
     from sf_depth.core.photoset import PhotoSetDepth
-    from sf_depth.core.sequence import SequenceDepth
+    from sf_depth.core.sequence import EachDepth, SequenceDepth
 
 _IMAGE, _INTRINSICS, _DEPTH = Quantity.IMAGE, Quantity.INTRINSICS, Quantity.DEPTH
 _DENSE_GOALS = frozenset({"slam", "recon"})

@@ -25,7 +25,7 @@ from sf_interfaces.types import Keyframe, PointCloud
 class DepthNode(BlockNode):
     """Completes the depth (Sec. III-C): sparse depth (mode ``complete``) or none (``slam``, ``posed``).
 
-    With ``source: sensors`` it is the head of its line and sends the colour of its keyframes too.
+    With ``source: sensors`` it is the head of its line and sends what a tracker would of its keyframes too.
     """
 
     short: ClassVar[str] = "depth"
@@ -37,10 +37,10 @@ class DepthNode(BlockNode):
         self.leader = ""
         self._depth = self._part(self.config())
         self._source = KeyframeSource(self, landmarks=True)
-        self._head = self.options.source == "sensors"
-        self._parts = (
-            set(COMPLETED) - (set() if self._head else {"image"}) - (set() if self._source.posed else {"pose"})
-        )
+        # Which frames get depth is known at once (complete), or only when they have it (posed).
+        self._at_once = self.config().mode == "complete"
+        self._source.announces({"image", "camera_info", "pose", *(("depth",) if self._at_once else ())})
+        self._parts = set(COMPLETED) - {"image"} - (set() if self._source.posed else {"pose"})
         for kind in self._parts:
             self.output(COMPLETED[kind])
         self.output(topics.DENSE_POINTS)
@@ -48,12 +48,12 @@ class DepthNode(BlockNode):
     def take(self, kind: str, msg: Any) -> None:
         """Complete the keyframes one message makes ready."""
         for keyframe in self._source.push(kind, msg):
-            self.guarded(lambda keyframe=keyframe: self._send(self._depth.add(keyframe)))  # type: ignore[misc]
+            self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
 
     def finish(self) -> None:
         """Complete what was still waiting."""
         for keyframe in self._source.end():
-            self.guarded(lambda keyframe=keyframe: self._send(self._depth.add(keyframe)))  # type: ignore[misc]
+            self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
         self.guarded(lambda: self._send(self._depth.finish()))
 
     def refresh(self) -> None:
@@ -77,8 +77,15 @@ class DepthNode(BlockNode):
             return SequenceDepth(config, PosedSetting(config.keyframe_baseline))
         raise ConfigError(f"mode '{config.mode}' of the depth node is not known; use complete, slam or posed")
 
+    def _add(self, keyframe: Keyframe) -> None:
+        if self._at_once:
+            self._source.announce(keyframe)
+        self._send(self._depth.add(keyframe))
+
     def _send(self, keyframes: Sequence[Keyframe]) -> None:
         for dense in keyframes:
+            if not self._at_once:
+                self._source.announce(dense)
             publish_bundle(self, dense, COMPLETED, self._parts)
             self.health.count("keyframes completed")
             if self.wanted(topics.DENSE_POINTS):

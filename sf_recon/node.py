@@ -62,6 +62,7 @@ class ReconNode(BlockNode):
         saved = self.snapshot("recon.sfmap")
         self._reconstruction = Reconstruction(self.config()) if saved is None else Reconstruction.load(saved)
         self._source = KeyframeSource(self, landmarks=False)
+        self._source.announces({"image", "camera_info", "pose", "depth"})
         self._unsaved, self._resumed = 0, saved is not None
         self._camera: Camera | None = None
         self._last_ns = 0
@@ -126,6 +127,7 @@ class ReconNode(BlockNode):
             self.health.waiting(self._source.waiting_for)
 
     def _add(self, keyframe: Keyframe) -> None:
+        self._source.announce(keyframe)
         if keyframe.depth is None:
             self.health.drop("keyframe without any depth")
             return

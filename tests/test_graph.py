@@ -127,7 +127,9 @@ def test_lines_without_a_tracker_are_equal_too(words: list[str], environment: di
             kinds = [f"/sf/depth/dense/{part}" for part in ("image", "variance")]
             found = [(raw.topic, result.decode(raw)) for raw in result.messages(kinds)]
             dense.append({(topic, to_ns(msg.header.stamp)): decode_depth(msg).z for topic, msg in found})
-            assert ("/sf/depth/dense/pose" in result.topics) == ("recon" in words)
+            kept = [kind for kind in ("image", "camera_info", "pose", "depth") if kind != "pose" or "recon" in words]
+            assert {f"/sf/tracking/keyframe/{kind}" for kind in kept} <= result.topics.keys()
+            assert ("/sf/depth/dense/pose" in result.topics) == ("pose" in kept)
     assert dense[0].keys() == dense[1].keys() and len(dense[0]) == 2 * 5
     for key, z in dense[0].items():
         np.testing.assert_allclose(dense[1][key], z, rtol=1e-5)

@@ -9,7 +9,7 @@ from typing import Any
 
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.io.atomic import replace_file
-from sf_interfaces.ros.bundles import COMPLETED, TRACKED, BundleInputs
+from sf_interfaces.ros.bundles import COMPLETED, TRACKED, BundleInputs, publish_bundle
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.types import Keyframe
@@ -26,6 +26,7 @@ class KeyframeSource:
     """
 
     def __init__(self, node: BlockNode, *, landmarks: bool) -> None:
+        self._node, self._announced = node, set[str]()
         self._sensors: SensorInputs | None = None
         self.posed = True
         self._done = _Progress(node)
@@ -67,6 +68,18 @@ class KeyframeSource:
             return
         self._sensors.assembler.end()
         yield from map(Keyframe.of, self._sensors.assembler.ready())
+
+    def announces(self, parts: set[str]) -> None:
+        """As the head of its line, tell which frames are keyframes: these parts go out on the tracker's topics."""
+        if self._sensors is not None:
+            self._announced = parts if self.posed else parts - {"pose"}
+            for kind in self._announced:
+                self._node.output(TRACKED[kind])
+
+    def announce(self, keyframe: Keyframe) -> None:
+        """Send a keyframe's parts where no tracker does."""
+        if self._announced:
+            publish_bundle(self._node, keyframe, TRACKED, self._announced)
 
     def done(self, stamp_ns: int) -> None:
         """Everything up to this keyframe is dealt with and safe: a successor of this process need not repeat it."""

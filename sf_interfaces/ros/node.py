@@ -175,6 +175,8 @@ class BlockNode(LifecycleNode):
             self._subscriptions_wanted.clear()
             self.setup()
             self.output(topics.stream(self.short))
+            if self.options.source == "sensors":
+                self.output(topics.consumed(self.short))  # a player looks for it before it sends anything
         except SceneFactoryError as error:
             return self._refuse(str(error))
         return TransitionCallbackReturn.SUCCESS
