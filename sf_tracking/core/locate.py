@@ -14,12 +14,14 @@ from sf_interfaces.types import Camera, Float64
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.bundle import information_root, jacobians, robust, whiten
 from sf_tracking.core.keyframes import Reprojection, TrackedKeyframe, reproject
+from sf_tracking.core.search import consensus
 from sf_tracking.core.update import UpdateOperator, View, search
 
 _SEARCH_SIGMA = 0.5  # px, of a position found by the search over levels
 _SEARCHED = 200  # patches searched over levels to find the motion
 _WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must not be rejected far from the truth
 _AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
+_MOST = 0.5  # share of them that must agree on a pose far from the predicted one
 _CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
 _MOTION = np.diag([0.03**-2] * 3 + [0.02**-2] * 3)  # information of a predicted pose, m and rad
 _HONEST, _PLENTY = 1.5, 80  # excess of errors and number of patches, from which patches alone are trusted
@@ -27,6 +29,7 @@ _STILL = 1e-6  # step of the pose, m and rad, that ends the iterations
 _MEDIAN_CHI2 = 1.386  # of two degrees of freedom
 _STEPS = 6  # at most, per robust scale
 _BEHIND = 1e-3  # of the unit ray, up to which a point counts as behind the camera
+_FAR = 1e-6  # inverse depth, 1/m, below which a point counts as that far
 _PRIOR = np.diag([1e2] * 3 + [1e3] * 3)  # information that the prediction adds where patches see nothing
 
 
@@ -186,9 +189,27 @@ class Locator:
                 break
         sights = join(parts)
         solved = self._pose(window, sights, predicted, (*_WIDE_SCALES, self._config.robust_sigmas))
-        agreeing = int((solved.error < 2 * self._config.inlier_px).sum())
+        if self._agreeing(solved) < _CERTAIN[1] * len(sights):
+            solved = self._outvoted(window, sights, solved)
+        agreeing = self._agreeing(solved)
         enough = agreeing >= self._config.min_inliers and agreeing > _AGREEING * len(sights)
         return solved.T_cw if enough else None
+
+    def _outvoted(self, window: Sequence[TrackedKeyframe], sights: Sights, solved: Solution) -> Solution:
+        """The pose that most sights vote for, where another than the one near the prediction has that many.
+
+        Bars and tiles are found one period off, and sights that err alike draw the pose away from the prediction.
+        """
+        X, w = _placed(window, sights)
+        T_cw = consensus(X / np.maximum(w, _FAR)[:, None], sights.uv, window[-1].camera, self._config)
+        if T_cw is None:
+            return solved
+        voted = self._pose(window, sights, T_cw, (self._config.robust_sigmas,))
+        most = self._agreeing(voted) > max(_MOST * len(sights), self._agreeing(solved))
+        return voted if most else solved
+
+    def _agreeing(self, solved: Solution) -> int:
+        return int((solved.error < 2 * self._config.inlier_px).sum())
 
     def align(
         self, window: Sequence[TrackedKeyframe], view: View, T_cw: Float64, *, thorough: bool = False
@@ -231,20 +252,29 @@ class Locator:
         self, window: Sequence[TrackedKeyframe], sights: Sights, T_cw: Float64, scales: Sequence[float]
     ) -> Solution:
         """Pose from sights whose information counts the uncertain depth of their patches."""
-        X, w = np.zeros((len(sights), 3)), np.zeros(len(sights))
+        X, w = _placed(window, sights)
         covariance = np.linalg.inv(sights.information)
         for index, keyframe in enumerate(window):
             mine = np.flatnonzero(sights.keyframe == index)
             if len(mine) == 0:
                 continue
             take = sights.patch[mine]
-            T_wc = se3.inverse(keyframe.T_cw)
-            rays = keyframe.patches.rays(keyframe.camera)[take]
-            w[mine] = keyframe.patches.w[take]
-            X[mine] = rays @ T_wc[:3, :2].T + T_wc[:3, 2] + w[mine, None] * T_wc[:3, 3]
             J_w = reproject(keyframe, T_cw).J_w[take] * keyframe.patches.sigma[take, None]
             covariance[mine] += J_w[:, :, None] * J_w[:, None, :]
         return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, np.linalg.inv(covariance), scales)
+
+
+def _placed(window: Sequence[TrackedKeyframe], sights: Sights) -> tuple[Float64, Float64]:
+    """Scaled points [E, 3] of sights, world position times inverse depth, and those inverse depths [E]."""
+    X, w = np.zeros((len(sights), 3)), np.zeros(len(sights))
+    for index, keyframe in enumerate(window):
+        mine = np.flatnonzero(sights.keyframe == index)
+        take = sights.patch[mine]
+        T_wc = se3.inverse(keyframe.T_cw)
+        rays = keyframe.patches.rays(keyframe.camera)[take]
+        w[mine] = keyframe.patches.w[take]
+        X[mine] = rays @ T_wc[:3, :2].T + T_wc[:3, 2] + w[mine, None] * T_wc[:3, 3]
+    return X, w
 
 
 def _thin(index: NDArray[np.int64], count: int) -> NDArray[np.int64]:

@@ -41,9 +41,9 @@ def relocate(
             if len(pair) == 2 and pair[0].distance < _RATIO * pair[1].distance:
                 world.append(se3.transform(T_wc, keyframe.patches.points(camera)[known[pair[0].queryIdx]]))
                 pixels.append(corners[pair[0].trainIdx].pt)
-    if len(world) < config.min_inliers:
+    if len(world) == 0:
         return None
-    return _solve(np.array(world), np.array(pixels) + 0.5, camera, config)
+    return consensus(np.array(world), np.array(pixels) + 0.5, camera, config)
 
 
 def _described(orb: cv2.ORB, keyframe: TrackedKeyframe) -> tuple[list[int], np.ndarray | None]:
@@ -59,7 +59,10 @@ def _described(orb: cv2.ORB, keyframe: TrackedKeyframe) -> tuple[list[int], np.n
     return [k.class_id for k in kept], descriptors
 
 
-def _solve(world: Float64, pixels: Float64, camera: Camera, config: TrackingConfig) -> Float64 | None:
+def consensus(world: Float64, pixels: Float64, camera: Camera, config: TrackingConfig) -> Float64 | None:
+    """Pose T_cw that most pairs of points [E, 3] m and pixels [E, 2] agree on, whatever the others say; or None."""
+    if len(world) < config.min_inliers:
+        return None
     cv2.setRNGSeed(config.seed)
     ok, rvec, tvec, inliers = cv2.solvePnPRansac(
         world, pixels, camera.K, None, iterationsCount=300, reprojectionError=_PNP_PX, flags=cv2.SOLVEPNP_EPNP

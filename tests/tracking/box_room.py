@@ -24,11 +24,23 @@ def _textures(seed: int) -> Float64:
     return np.clip(128 + 45 * out, 0, 255)
 
 
+def barred(seed: int) -> Float64:
+    """Plain walls with dark marks, and bars before a part of each: much of what there is to see repeats itself."""
+    rng = np.random.default_rng(seed)
+    out = np.full((6, 512, 512), 205.0)
+    for face in out:
+        for u, v, a, b in zip(*rng.integers(0, 490, (2, 240)), *rng.integers(6, 22, (2, 240)), strict=True):
+            face[v : v + b, u : u + a] = rng.uniform(90, 180)
+        bars = np.broadcast_to((np.arange(110) % 34 < 8) | (np.arange(512) % 90 < 3)[:, None], (512, 110))
+        face[:, 290:400] = np.where(bars, 45.0, 215.0)
+    return out
+
+
 class BoxRoom:
     """Renders frames by intersecting rays with the six walls."""
 
-    def __init__(self, seed: int = 0) -> None:
-        self._textures = _textures(seed).astype(np.float32)
+    def __init__(self, seed: int = 0, textures: Float64 | None = None) -> None:
+        self._textures = (_textures(seed) if textures is None else textures).astype(np.float32)
         self._rng = np.random.default_rng(seed)
 
     def view(self, T_wc: Float64) -> tuple[np.ndarray, np.ndarray]:
