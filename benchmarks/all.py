@@ -21,7 +21,7 @@ _ROOMS = ["room0", "room1", "room2", "office0", "office1", "office2", "office3",
 FOLDER = {
     "speed": ([], ["--frames", "300", "--stride", "1", "--factor", "1"]),
     "rooms": ([], ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1"]),
-    "depth": ([], ["--scenes", *_ROOMS, "hall", "--views", "10", "--factor", "1", "--oracle"]),
+    "depth": (["--line", "room0"], ["--all", "--oracle", "--line", *_ROOMS, "hall"]),
     "scales": ([], ["--frames", "400", "--factor", "1"]),
     "real": ([], ["--frames", "1000"]),
 }
@@ -32,6 +32,7 @@ FILE = {
     "play_record": (["--frames", "90", "--rates", "1", "4"], []),
     "completion": ([], []),
 }
+USE_DATA = ("real", "completion", "depth")
 NEED_DATA = ("real", "completion")
 
 
@@ -44,7 +45,7 @@ def commands(full: bool, data: Path | None, out: Path) -> dict[str, list[str]]:
             continue
         target = out if name in FOLDER else out / f"{name}.json"
         command = [sys.executable, str(script), "--out", str(target), *(everything if full else quick)]
-        found[name] = [*command, "--data", str(data)] if name in NEED_DATA else command
+        found[name] = [*command, "--data", str(data)] if name in USE_DATA and data is not None else command
     return found
 
 

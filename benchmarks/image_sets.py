@@ -1,0 +1,152 @@
+"""Sets of images with the truth about them: simulated ones with exact depth, real ones with what reference they bring.
+
+Options of the depth block are chosen on simulated sets of other places and, of 7-Scenes, on frames 0-99 only: the sets
+here use frames 100-199.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from sf_bringup.simulate import PRESETS, Simulator
+from sf_interfaces.geometry import se3
+from sf_interfaces.geometry.registration import register_depth
+from sf_interfaces.io.datasets.indoor import SevenScenes
+from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
+
+CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
+# Preset, seconds along its path, views, baseline over depth, largest roll deg. The first few serve a quick run.
+SIMULATED = (
+    ("room", 12.0, 5, 0.15, 3.0),
+    ("campus", 10.0, 6, 0.15, 3.0),
+    ("room0", 20.0, 5, 0.15, 25.0),
+    ("demo", 1.0, 5, 0.12, 3.0),
+    ("room", 40.0, 8, 0.12, 3.0),
+    ("hall", 20.0, 6, 0.12, 3.0),
+)
+SEVEN_SCENES = ((120, 100, 110, 130, 140), (150, 110, 130, 170, 190), (180, 140, 160, 170, 199))
+QUICK_SIMULATED, QUICK_SEVEN_SCENES = 3, 2
+FOUNTAIN = (5, 3, 4, 6, 7)
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """Images of one camera, the first is the reference; ``truth`` is its depth, None where there is none."""
+
+    name: str
+    camera: Camera
+    images: list[UInt8]
+    poses: list[Float64]  # T_map_camera
+    truth: DepthMap | None
+
+    @property
+    def T_source_reference(self) -> Float64:
+        """Motion from the reference into every other view, [S, 4, 4]."""
+        return np.stack([se3.inverse(T) @ self.poses[0] for T in self.poses[1:]])
+
+    def only(self, sources: list[int]) -> ImageSet:
+        """The reference with some of the other views, counted from 1."""
+        keep = [0, *sources]
+        return ImageSet(
+            self.name, self.camera, [self.images[k] for k in keep], [self.poses[k] for k in keep], self.truth
+        )
+
+
+def simulated(everything: bool = True) -> Iterator[ImageSet]:
+    """Views from around a place of a scene's path, turned to nearly the same point, with sensor noise."""
+    chosen = SIMULATED if everything else SIMULATED[:QUICK_SIMULATED]
+    for seed, (preset, seconds, count, baseline, roll) in enumerate(chosen):
+        simulator = Simulator(PRESETS[preset])
+        rng = np.random.default_rng(seed)
+        first = simulator.path.pose(seconds)
+        yield _around(f"{preset} {seconds:.0f} s", simulator, first, count, baseline, roll, rng)
+
+
+def _around(
+    name: str, simulator: Simulator, first: Float64, count: int, baseline: float, roll: float, rng: np.random.Generator
+) -> ImageSet:
+    """The view ``first`` and others that look at what it sees."""
+    image, z = simulator.renderer.render(CAMERA, first)
+    poses, images, depth, angle = [first], [image], float(np.nanmedian(z)), 0.0
+    while len(poses) < count:
+        angle += 2 * np.pi / (count - 1) + rng.uniform(-0.3, 0.3)
+        step = baseline * depth * np.array([np.cos(angle), 0.6 * np.sin(angle), rng.uniform(-0.5, 0.5)])
+        eye = first[:3, 3] + first[:3, :3] @ step
+        if simulator.renderer.clearance(eye[None])[0] < 0.15 * min(depth, 3.0):
+            continue
+        target = first[:3, 3] + first[:3, 2] * depth + rng.normal(0, 0.06 * depth, 3)
+        poses.append(_toward(eye, target, rng.uniform(-roll, roll)))
+        images.append(simulator.renderer.render(CAMERA, poses[-1])[0])
+    noisy = [np.clip(i + rng.standard_normal(i.shape) + 0.5, 0, 255).astype(np.uint8) for i in images]
+    return ImageSet(name, CAMERA, noisy, poses, DepthMap(z))
+
+
+def _toward(eye: Float64, target: Float64, roll: float) -> Float64:
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[:3, 3] = eye
+    return T @ se3.exp(np.array([0, 0, 0, 0, 0, np.radians(roll)]))
+
+
+def real(data: Path, everything: bool = True) -> Iterator[ImageSet]:
+    """The image sets of a folder of recordings."""
+    chosen = SEVEN_SCENES if everything else SEVEN_SCENES[:QUICK_SEVEN_SCENES]
+    yield from seven_scenes(data / "rgbd_7scenes_redkitchen_000_199", chosen)
+    yield fountain(data / "mvs_strecha_fountain_P11")
+    yield robustmvd(data / "mvd_robustmvd_sample")
+
+
+def seven_scenes(folder: Path, sets: tuple[tuple[int, ...], ...]) -> Iterator[ImageSet]:
+    """A hand-held Kinect; its depth is registered to colour, its poses are good to a degree or two."""
+    T = SevenScenes.T_COLOR_DEPTH
+    for frames in sets:
+        stems = [folder / f"frame-{k:06d}" for k in frames]
+        raw = cv2.imread(f"{stems[0]}.depth.png", cv2.IMREAD_UNCHANGED)
+        measured = DepthMap(np.where((raw == 0) | (raw == 65535), np.nan, raw * 1e-3))
+        truth = register_depth(measured, SevenScenes.DEPTH_CAMERA, SevenScenes.COLOR_CAMERA, T)
+        poses = [se3.orthonormalise(np.loadtxt(f"{stem}.pose.txt")) @ se3.inverse(T) for stem in stems]
+        images = [_rgb(Path(f"{stem}.color.jpg")) for stem in stems]
+        yield ImageSet(f"7-Scenes {frames[0]}", SevenScenes.COLOR_CAMERA, images, poses, truth)
+
+
+def fountain(folder: Path, factor: float = 0.5) -> ImageSet:
+    """Five neighbouring photos; reference cameras, no depth."""
+    images, poses = [], []
+    for k in FOUNTAIN:
+        numbers = np.array((folder / "gt_dense_cameras" / f"{k:04d}.jpg.camera").read_text().split(), dtype=float)
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = numbers[12:21].reshape(3, 3), numbers[21:24]
+        poses.append(T)
+        images.append(_rgb(folder / "images" / f"{k:04d}.jpg", factor))
+    return ImageSet("fountain-P11", _reduced(numbers[:9].reshape(3, 3), factor, images[0]), images, poses, None)
+
+
+def robustmvd(folder: Path, factor: float = 0.5) -> ImageSet:
+    """One key view and six sources; reference poses, no depth."""
+    parts = [folder / "key", *(folder / "source" / str(k) for k in range(6))]
+    images = [_rgb(part / "image.png", factor) for part in parts]
+    camera = _reduced(np.load(folder / "key" / "K.npy").astype(float), factor, images[0])
+    motions = [np.load(part / "to_ref_transform.npy").astype(float) for part in parts[1:]]
+    poses = [np.eye(4), *(se3.inverse(se3.orthonormalise(T)) for T in motions)]
+    return ImageSet("robustmvd", camera, images, poses, None)
+
+
+def _rgb(path: Path, factor: float = 1.0) -> UInt8:
+    image = cv2.imread(str(path))[..., ::-1]
+    return np.ascontiguousarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+
+
+def _reduced(K: Float64, factor: float, image: UInt8) -> Camera:
+    """The camera of an image reduced by ``factor``, pixel centres at + 0.5."""
+    height, width = image.shape[:2]
+    fx, fy, cx, cy = (float(v) for v in (K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5))
+    return Camera(width, height, fx * factor, fy * factor, cx * factor, cy * factor)
