@@ -113,7 +113,7 @@ def run(bag: Path, line: Line, engine: str, out: Path) -> dict[str, Any]:
     kinds = ("trajectory", "depth", "completion", "render")
     measures = {key: summary[key] for key in kinds if isinstance(summary.get(key), dict)}
     surface = out / "surface.ply"
-    points = len(read_surface(surface).points) if surface.is_file() else None
+    points = len(read_surface(surface).vertices) if surface.is_file() else None
     return {**row, "blocks": summary["line"], "seconds": summary["seconds"], "points": points, **measures}
 
 
@@ -122,7 +122,7 @@ def geometry(folder: Path) -> Float64 | None:
     if (folder / "trajectory.tum").is_file():
         return read_tum(folder / "trajectory.tum").positions
     if (folder / "surface.ply").is_file():
-        return np.asarray(read_surface(folder / "surface.ply").points, np.float64)
+        return read_surface(folder / "surface.ply").vertices
     maps = [np.load(path)["z"].reshape(-1, 1) for path in sorted((folder / "depth").glob("*.npz"))]
     return np.concatenate(maps).astype(np.float64) if maps else None
 
