@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, Sc
 from sf_recon.config import ReconConfig
 
 _SIGMA_FLOOR = 0.1  # of the largest accepted sigma: weights stay within a factor of 100
+_AGREEING = 0.05  # relative difference of depth, up to which neighbouring pixels agree
+_NEIGHBOURS = 2  # that must agree with a measured pixel
+_DENSE = 0.2  # share of measured pixels, above which each has neighbours
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +48,21 @@ def backproject(camera: Camera, T_map_camera: Float64, z: Float32, pixels: NDArr
     return points, (rays / np.linalg.norm(rays, axis=1, keepdims=True)) @ R.T
 
 
+def supported(z: Float32) -> NDArray[np.bool_]:
+    """Pixels of a depth image [H, W] m that two of their eight neighbours agree with.
+
+    Others fly between two surfaces or before one, as at the edges of a time-of-flight image; seen from close by, each
+    would cover what is behind it.
+    """
+    height, width = z.shape
+    around = np.pad(z, 1, constant_values=np.nan)
+    agreeing = np.zeros(z.shape, np.uint8)
+    for row, column in product(range(3), repeat=2):
+        other = around[row : row + height, column : column + width]
+        agreeing += np.abs(other - z) < _AGREEING * z
+    return agreeing >= _NEIGHBOURS + 1  # the pixel agrees with itself
+
+
 def observe(keyframe: Keyframe, config: ReconConfig) -> Observation:
     """Unproject the depth that is certain enough.
 
@@ -58,7 +77,9 @@ def observe(keyframe: Keyframe, config: ReconConfig) -> Observation:
             f"keyframe at {keyframe.stamp_ns} ns: depth is {depth.z.shape[1]}x{depth.z.shape[0]} but the "
             f"camera is {camera.width}x{camera.height}; register depth to the image first"
         )
-    usable = depth.valid.reshape(-1)
+    # A stated variance already tells what to trust; of a bare depth image only the neighbours do.
+    bare = depth.variance is None and depth.density > _DENSE
+    usable = (supported(depth.z) if bare else depth.valid).reshape(-1)
     weights = np.ones(usable.shape, np.float32)
     if depth.variance is not None:
         z, variance = depth.z.reshape(-1), depth.variance.reshape(-1)
