@@ -32,6 +32,7 @@ from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.types import Float64
 
 COLOR, INFO = "/camera/color/image_raw", "/camera/color/camera_info"
+TRUE_DEPTH = "/ground_truth/depth/image"
 DEPTH, LIDAR, POSE = "/camera/depth/image_raw", "/lidar/points", "/ground_truth/pose"
 FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8"]
 
@@ -92,10 +93,13 @@ def derive(whole: Path, line: Line, target: Path) -> Path:
     """A bag with the inputs of a line, the references, and the static transforms."""
     depth_only = COLOR not in line.topics
     with BagReader(whole) as reader, SequenceWriter(target) as writer:
+        # Where nothing better is known, a depth camera is the reference of what is estimated from images.
+        wanted = line.topics if TRUE_DEPTH in reader.topics else {*line.topics, DEPTH}
         for raw in reader.messages():
-            if raw.topic not in line.topics and not raw.topic.startswith(("/ground_truth/", "/tf_static")):
+            if raw.topic not in wanted and not raw.topic.startswith(("/ground_truth/", "/tf_static")):
                 continue
             topic = raw.topic.replace("/color/", "/depth/") if depth_only and raw.topic == INFO else raw.topic
+            topic = TRUE_DEPTH if raw.topic == DEPTH and DEPTH not in line.topics else topic
             writer.bag.write(topic, raw.type, raw.stamp_ns, raw.data)
             if line.posed and raw.topic == POSE:
                 writer.bag.write("/given/pose", raw.type, raw.stamp_ns, raw.data)

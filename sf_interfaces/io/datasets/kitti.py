@@ -157,20 +157,10 @@ class KittiOdometry(Dataset):
 
 
 @dataclass(frozen=True)
-class KittiStereo(Dataset):
-    """Single frames of KITTI stereo 2015 with a sweep each: LiDAR completion, without times and poses.
+class KittiDay(Dataset):
+    """What belongs to a recording day: its calibration, images of camera 2 and sweeps."""
 
-    Disparity of image 02 against 03 becomes reference depth (256 units a pixel, 0 none).
-    """
-
-    name: ClassVar[str] = "KITTI completion frames"
-    evidence: ClassVar[str] = "image_02/*.png, velodyne_points/*.bin, calib_*.txt there or above; gt/disp_occ_0/*.png"
-    goal: ClassVar[str] = "completion"
-
-    @staticmethod
-    def matches(path: Path) -> bool:
-        has_images = any((path / "image_02").glob("*.png"))
-        return has_images and (path / "velodyne_points").is_dir() and calibration_folder(path.resolve()) is not None
+    images: ClassVar[str]  # where the images lie below the folder
 
     @cached_property
     def _calibration(self) -> Path:
@@ -182,13 +172,31 @@ class KittiStereo(Dataset):
 
     @cached_property
     def _images(self) -> list[Path]:
-        return images_in(self.path / "image_02")
+        return images_in(self.path / self.images)
 
     def __len__(self) -> int:
         return len(self._images)
 
     def extrinsics(self) -> Sequence[tuple[str, str, Float64]]:
         return ((OPTICAL, LIDAR, self._rig.T_camera_lidar),)
+
+
+@dataclass(frozen=True)
+class KittiStereo(KittiDay):
+    """Single frames of KITTI stereo 2015 with a sweep each: LiDAR completion, without times and poses.
+
+    Disparity of image 02 against 03 becomes reference depth (256 units a pixel, 0 none).
+    """
+
+    name: ClassVar[str] = "KITTI completion frames"
+    evidence: ClassVar[str] = "image_02/*.png, velodyne_points/*.bin, calib_*.txt there or above; gt/disp_occ_0/*.png"
+    goal: ClassVar[str] = "completion"
+    images: ClassVar[str] = "image_02"
+
+    @staticmethod
+    def matches(path: Path) -> bool:
+        has_images = any((path / "image_02").glob("*.png"))
+        return has_images and (path / "velodyne_points").is_dir() and calibration_folder(path.resolve()) is not None
 
     def samples(self) -> Iterator[Reader]:
         for i, file in enumerate(self._images):

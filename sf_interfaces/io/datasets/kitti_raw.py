@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -14,9 +14,9 @@ import numpy as np
 
 from sf_interfaces.errors import FormatError, SceneFactoryError
 from sf_interfaces.geometry import se3
-from sf_interfaces.io.datasets.dataset import LIDAR, OPTICAL, Dataset, Reader, Sample
-from sf_interfaces.io.datasets.files import images_in, number_of, read_numbers, read_rgb, read_sweep
-from sf_interfaces.io.datasets.kitti import Rig, calibration_folder, motion, raw_rig, read_rows
+from sf_interfaces.io.datasets.dataset import Reader, Sample
+from sf_interfaces.io.datasets.files import number_of, read_numbers, read_rgb, read_sweep
+from sf_interfaces.io.datasets.kitti import KittiDay, Rig, motion, read_rows
 from sf_interfaces.types import Float64
 
 _EARTH_RADIUS_M = 6378137.0
@@ -39,7 +39,7 @@ def _read_times(path: Path) -> list[int]:
 
 
 @dataclass(frozen=True)
-class KittiRaw(Dataset):
+class KittiRaw(KittiDay):
     """A synchronised KITTI raw drive.
 
     Ground truth comes from the GPS/IMU (oxts): Mercator position, roll, pitch, yaw, carried over to the camera,
@@ -48,28 +48,11 @@ class KittiRaw(Dataset):
 
     name: ClassVar[str] = "KITTI raw"
     evidence: ClassVar[str] = "image_02/data/*.png, image_02/timestamps.txt; velodyne_points/, oxts/; calib_*.txt above"
+    images: ClassVar[str] = "image_02/data"
 
     @staticmethod
     def matches(path: Path) -> bool:
         return (path / "image_02" / "timestamps.txt").is_file() and (path / "image_02" / "data").is_dir()
-
-    @cached_property
-    def _calibration(self) -> Path:
-        return calibration_folder(self.path.resolve()) or self.path
-
-    @cached_property
-    def _rig(self) -> Rig:
-        return raw_rig(self._calibration)
-
-    @cached_property
-    def _images(self) -> list[Path]:
-        return images_in(self.path / "image_02" / "data")
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def extrinsics(self) -> Sequence[tuple[str, str, Float64]]:
-        return ((OPTICAL, LIDAR, self._rig.T_camera_lidar),)
 
     def samples(self) -> Iterator[Reader]:
         oxts = _Oxts(self.path / "oxts", self._calibration, self._rig) if (self.path / "oxts").is_dir() else None
