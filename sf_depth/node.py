@@ -38,7 +38,7 @@ class DepthNode(BlockNode):
         self._depth = self._part(self.config())
         self._source = KeyframeSource(self, landmarks=True)
         self._head = self.options.source == "sensors"
-        self._parts = set(COMPLETED) if self._head else set(COMPLETED) - {"image"}
+        self._parts = set(COMPLETED) if self._head else set(COMPLETED) - {"image", "state"}
         for kind in self._parts:
             self.output(COMPLETED[kind])
         self.output(topics.DENSE_POINTS)
