@@ -22,9 +22,8 @@ _NEIGHBOURS = 15  # latest keyframes that are no loop
 _CANDIDATES = 3  # places that are verified
 _APART = 5  # keyframes between two of them
 _ALIKE = 1.4  # score of a candidate relative to the median
-_ODOMETRY_PX = 0.2  # what a relative pose between neighbours errs by, as displacement of its landmarks
-_LOOP_PX = 1.0  # and one found by recognition
-_SCALE_SIGMA = (0.005, 0.02)  # of a neighbour and of a loop, where the unit drifts
+_ODOMETRY_PX = 0.5  # what a relative pose between neighbours errs by, as displacement of its landmarks
+_ODOMETRY_STRETCH, _LOOP_STRETCH = 0.005, 0.02  # and its unit, and that of a loop
 _NEWS = 3.0  # deviations from which on a loop tells anything that the map does not know
 _SAME_PLACE = (0.04, 0.04, 0.15)  # two sightings agree: share of the depth, rad, log of scale
 _WITHIN = 3  # keyframes after the first sighting in which a second one has to confirm it
@@ -34,10 +33,16 @@ _TURN, _STRETCH = 0.35, 0.7  # rad and log of scale that it may ask for
 
 @dataclass(frozen=True, slots=True)
 class Recognised:
-    """A view found again: near keyframe number ``index``, at S in the map (scale: its unit in the map's)."""
+    """A view found again: near keyframe number ``index``, at S in the map (scale: its unit in the map's).
+
+    Args:
+        sigma: [7] deviations of S in its own frame (m, rad, log of scale).
+        inliers: corners of the view that agree.
+    """
 
     index: int
     S: Float64
+    sigma: Float64
     inliers: int
 
 
@@ -79,12 +84,10 @@ class KeyframeMap:
         self.S = np.concatenate([self.S, T[None]])
         step = float(np.linalg.norm(self.S[n, :3, 3] - self.S[n - 1, :3, 3])) if n else 0.0
         self._walked.append((self._walked[-1] if n else 0.0) + step)
-        landmarks = keyframe.landmarks
-        depth = 1.0 if landmarks is None or not len(landmarks) else float(np.median(landmarks.points[:, 2]))
         if found is not None:
-            self._tie(found.index, n, T, keyframe.camera, depth, loop=True)
+            self._tie(found.index, n, T, found.sigma, loop=True)
         elif n:
-            self._tie(n - 1, n, T, keyframe.camera, depth, loop=False)
+            self._tie(n - 1, n, T, _odometry_sigma(keyframe), loop=False)
         self._parts = self._search(keyframe, n)
 
     def work(self) -> bool:
@@ -168,7 +171,8 @@ class KeyframeMap:
         unit = 1.0 if own is None or seen is None else seen.unit(own)
         if seen is None or unit is None:
             return []
-        return [Recognised(index, sim3.similarity(seen.T, unit), seen.inliers)]
+        sigma = np.r_[seen.sigma, _LOOP_STRETCH]
+        return [Recognised(index, sim3.similarity(seen.T, unit), sigma, seen.inliers)]
 
     def _unambiguous(self, found: list[Recognised]) -> Recognised | None:
         """The best of some results, unless another contradicts it: then two places look alike."""
@@ -189,9 +193,8 @@ class KeyframeMap:
         """Take a loop that tells something new, once a second sighting has confirmed it."""
         place = self.places[n]
         Z = sim3.inverse(self.S[loop.index]) @ loop.S
-        sigma = self._sigma(place.camera, place.depth, loop=True)
         r, _ = sim3.coordinates(sim3.inverse(Z) @ sim3.inverse(self.S[loop.index]) @ self.S[n])
-        if np.abs(r / sigma).max() < _NEWS:
+        if np.abs(r / loop.sigma).max() < _NEWS:
             self._hint = None
             return
         hint = self._hint if n - self._hinted <= _WITHIN else None
@@ -199,19 +202,14 @@ class KeyframeMap:
             expected = hint.S @ sim3.inverse(self.S[self._hinted]) @ self.S[n]
             if self.agree(expected, loop.S, place.depth * float(sim3.scale_of(loop.S))):
                 for seen, at in ((hint, self._hinted), (loop, n)):
-                    self._tie(seen.index, at, seen.S, place.camera, place.depth, loop=True)
+                    self._tie(seen.index, at, seen.S, seen.sigma, loop=True)
                 self._news = True
         self._hint, self._hinted = loop, n
 
     # ---- the graph
 
-    def _tie(self, i: int, j: int, S_j: Float64, camera: Camera, depth: float, *, loop: bool) -> None:
-        self.edges.append((i, j, sim3.inverse(self.S[i]) @ S_j, self._sigma(camera, depth, loop=loop), loop))
-
-    def _sigma(self, camera: Camera, depth: float, *, loop: bool) -> Float64:
-        """Deviations [7] of a relative pose: what displaces landmarks ``depth`` away by some pixels."""
-        turn = (_LOOP_PX if loop else _ODOMETRY_PX) / camera.fx
-        return np.array([*[turn * depth] * 3, *[turn] * 3, _SCALE_SIGMA[loop]])
+    def _tie(self, i: int, j: int, S_j: Float64, sigma: Float64, *, loop: bool) -> None:
+        self.edges.append((i, j, sim3.inverse(self.S[i]) @ S_j, sigma, loop))
 
     def _graph(self) -> Edges:
         i, j, Z, sigma, loop = (list(part) for part in zip(*self.edges, strict=True))
@@ -228,3 +226,10 @@ class KeyframeMap:
     def poses(self) -> dict[int, Float64]:
         """T_map_camera of every keyframe, by stamp."""
         return dict(zip(self.stamps, sim3.rigid(self.S), strict=True)) if self.stamps else {}
+
+
+def _odometry_sigma(keyframe: Keyframe) -> Float64:
+    """Deviations [7] of the pose of a keyframe relative to the one before: a displacement of its landmarks in px."""
+    cloud, turn = keyframe.landmarks, _ODOMETRY_PX / keyframe.camera.fx
+    depth = 1.0 if cloud is None or not len(cloud) else float(np.median(cloud.points[:, 2]))
+    return np.array([*[turn * depth] * 3, *[turn] * 3, _ODOMETRY_STRETCH])

@@ -25,6 +25,7 @@ _CELLS, _MIN_CELLS = 4, 4  # the image has 4 x 4 cells; the inliers lie in so ma
 _SCALE_PX = 6.0  # a corner takes the depth of a landmark of its image this near
 _MIN_SCALED = 10  # corners with such a depth, from which the ratio of two units is known
 _PNP = cv2.SOLVEPNP_EPNP
+_CORNER_PX, _INDEPENDENT = 0.7, 100  # deviation of a corner, and how many of them err independently
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,10 +34,12 @@ class Sighting:
 
     Args:
         T: pose of the camera in the frame and the unit of the places.
+        sigma: [6] deviations of the pose in the camera's own frame (unit of the places, rad).
         uv: [K, 2] px corners that agree; points: [K, 3] where they lie, in the frame of the places.
     """
 
     T: Float64
+    sigma: Float64
     uv: Float64
     points: Float64
 
@@ -78,7 +81,8 @@ def sight(places: Sequence[Place], S: Float64, found: Features, camera: Camera) 
         return None
     if _seen(points, T_cw, camera, found, point[inlier]) < _MIN_SEEN:
         return None
-    return Sighting(se3.inverse(T_cw), uv, points[point[inlier][first]])
+    agreeing = points[point[inlier][first]]
+    return Sighting(se3.inverse(T_cw), _deviations(se3.transform(T_cw, agreeing), camera), uv, agreeing)
 
 
 def _matches(known: UInt8, wanted: UInt8) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -108,6 +112,21 @@ def _pose(points: Float64, uv: Float64, camera: Camera) -> tuple[Float64 | None,
     with np.errstate(invalid="ignore"):
         good = np.linalg.norm(camera.project(se3.transform(T, points))[0] - uv, axis=1) < px
     return T, np.flatnonzero(good)
+
+
+def _deviations(X: Float64, camera: Camera) -> Float64:
+    """Deviations [6] of a pose from which points X [K, 3], camera frame, are seen.
+
+    Errors of corners and depths are alike in neighbours, so many points tell no more than ``_INDEPENDENT``.
+    """
+    z = X[:, 2]
+    on_axis = X[:, :2] / z[:, None]
+    J = np.zeros((len(X), 2, 3))
+    J[:, 0, 0], J[:, 1, 1], J[:, :, 2] = 1.0, 1.0, -on_axis
+    J *= np.array([camera.fx, camera.fy])[:, None] / z[:, None, None]
+    J_xi = np.concatenate([-J, J @ se3.hat(X)], axis=2).reshape(-1, 6)
+    covariance = np.linalg.inv(J_xi.T @ J_xi) * len(X) / min(len(X), _INDEPENDENT)
+    return np.asarray(_CORNER_PX * np.sqrt(np.diag(covariance)))
 
 
 def _spread(uv: Float64, camera: Camera) -> int:
