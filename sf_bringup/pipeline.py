@@ -22,6 +22,7 @@ from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import sync_values
 from sf_interfaces.blocks import BlockSpec, Quantity, load_blocks
 from sf_interfaces.config import ConfigFile, build
+from sf_interfaces.corrections import Corrections
 from sf_interfaces.errors import ConfigError, FormatError, TrackingLost
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.sequence_writer import SequenceWriter
@@ -29,7 +30,7 @@ from sf_interfaces.io.trajectory import write_tum
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.sync import SyncConfig
 from sf_interfaces.timing import Timings
-from sf_interfaces.types import Float64, Frame, Keyframe, Scale, Trajectory
+from sf_interfaces.types import Float64, Frame, Keyframe, Trajectory
 
 PARTS_GROUP = "scenefactory.parts"
 
@@ -66,13 +67,14 @@ class ProductionLine:
         self._writer, self._config, self._epoch = writer, config, 0
         self.timings = Timings()
         writer.posed = self.tracker is not None or posed
-        self.keyframe_poses: list[tuple[int, Float64]] = []
+        self.keyframe_poses: dict[int, Float64] = {}
         self.completed = 0  # keyframes that got dense depth
+        self._corrections = Corrections()
 
     def in_epoch(self, epoch: int) -> None:
         """A backward jump of time ends one sequence and begins another: the tracker starts anew."""
         if self.tracker is not None and epoch != self._epoch:
-            self._finish_keyframes(self.tracker.finish().keyframes)
+            self._finish_keyframes(self.tracker.finish())
             self.tracker = make_part(self._tracker_id, self._config)
         if self._depth is not None and epoch != self._epoch:
             self._completed(self._depth.finish())
@@ -92,8 +94,8 @@ class ProductionLine:
             with self.timings.measure("tracking"):
                 update = self.tracker.track(frame)
             self._writer.tracked(frame, update)
-            self._finish_keyframes(update.keyframes)
-            return update.T_map_camera if update.scale is Scale.METRIC else None
+            self._finish_keyframes(update)
+            return update.T_odom_camera
         if frame.image is not None and frame.camera is not None:
             keyframe = Keyframe.of(frame)
             if not self._posed_depth:
@@ -104,16 +106,22 @@ class ProductionLine:
     def finish(self) -> None:
         """End of the input: the tracker's window becomes final, the colour field gets its last sweeps."""
         if self.tracker is not None:
-            self._finish_keyframes(self.tracker.finish().keyframes)
+            self._finish_keyframes(self.tracker.finish())
         if self._depth is not None:
             self._completed(self._depth.finish())
         if self.reconstruction is not None:
+            self._correct(self._corrections.due())
             self.reconstruction.finish()
 
-    def _finish_keyframes(self, keyframes: Sequence[Keyframe]) -> None:
-        for keyframe in keyframes:
-            self.keyframe_poses.append((keyframe.stamp_ns, keyframe.T_map_camera))
-            self._writer.keyframe(keyframe)
+    def _finish_keyframes(self, update: Any) -> None:
+        """Take final keyframes on; a correction that comes with them belongs to the last."""
+        for keyframe in update.keyframes:
+            correction = update.correction if keyframe is update.keyframes[-1] else None
+            self.keyframe_poses[keyframe.stamp_ns] = keyframe.T_map_camera
+            if correction is not None:
+                self.keyframe_poses |= dict(zip(correction.stamps_ns.tolist(), correction.poses, strict=True))
+                self._corrections.push(keyframe.stamp_ns, correction)
+            self._writer.keyframe(keyframe, correction)
             self._complete(keyframe)
 
     @property
@@ -145,9 +153,15 @@ class ProductionLine:
 
     def _reconstruct(self, keyframe: Keyframe) -> None:
         if self.reconstruction is not None:
+            self._correct(self._corrections.due(keyframe.stamp_ns))
             with self.timings.measure("recon"):
                 added = self.reconstruction.add(keyframe)
             self._writer.surface(keyframe.stamp_ns, added)
+
+    def _correct(self, correction: Trajectory | None) -> None:
+        if correction is not None:
+            with self.timings.measure("correction"):
+                self.reconstruction.correct(correction)
 
 
 def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile, rate: float) -> dict[str, int]:
@@ -265,7 +279,9 @@ def _save(folder: RunFolder, line: ProductionLine, writer: ResultWriter) -> None
     if line.tracker is not None:
         trajectory = line.tracker.trajectory()
         write_tum(folder.path / "trajectory.tum", trajectory)
-        write_tum(folder.path / "keyframes.tum", Trajectory.from_pairs(line.keyframe_poses, trajectory.scale))
+        write_tum(
+            folder.path / "keyframes.tum", Trajectory.from_pairs(list(line.keyframe_poses.items()), trajectory.scale)
+        )
         writer.path(trajectory)
     if line.reconstruction is not None:
         line.reconstruction.save_products(folder.path)

@@ -196,9 +196,7 @@ class Player:
         self._executor.spin_once(timeout_sec=max(0.0, seconds))
 
     def wait_for_subscribers(self) -> None:
-        """Until the head topic (any topic, where there is none) has a subscriber and matching has settled.
-
-        Lossless also waits to see who gives the credits: on a busy machine they are discovered seconds later.
+        """Until the head topic (any topic, where there is none) has a subscriber, and lossless those who give credits.
 
         Raises:
             ConfigError: lossless, and nobody came.
@@ -215,8 +213,8 @@ class Player:
                 return
             self._spin(0.05)
         missing = [f"published on {t}" for t in self._options.consumed if not self._node.count_publishers(t)]
-        wanted = missing[0] if missing else f"subscribed to {self._head or 'any topic'}"
-        words = f"nobody {wanted} within {self._options.wait_s:g} s"
+        missing.append(f"subscribed to {self._head or 'any topic'}")
+        words = f"nobody {missing[0]} within {self._options.wait_s:g} s"
         if self._options.lossless:
             raise ConfigError(f"{words}; start the consumer first, or raise --wait")
         print(f"player: {words}; playing all the same", file=sys.stderr, flush=True)

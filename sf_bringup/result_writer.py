@@ -45,8 +45,8 @@ class ResultWriter:
         self._writer.pose(topics.TRACKING_POSE.name, stamp, T, "map")
         self._writer.tf(stamp, "map", frame.camera.frame_id, T)
 
-    def keyframe(self, keyframe: Keyframe) -> None:
-        """The bundle of a final keyframe."""
+    def keyframe(self, keyframe: Keyframe, correction: Trajectory | None = None) -> None:
+        """The bundle of a final keyframe, with the poses it corrects."""
         stamp, frame_id = keyframe.stamp_ns, keyframe.camera.frame_id
         w = self._writer
         w.image(topics.KEYFRAME_IMAGE.name, stamp, keyframe.image, frame_id)
@@ -58,6 +58,7 @@ class ResultWriter:
         if keyframe.landmarks is not None:
             cloud = PointCloud(keyframe.landmarks.points, stamp_ns=stamp, frame_id=frame_id)
             w.cloud(topics.KEYFRAME_LANDMARKS.name, cloud)
+        w.keyframe_state(topics.KEYFRAME_STATE.name, stamp, keyframe.scale, correction)
         self._count("keyframes")
 
     def dense(self, keyframe: Keyframe) -> None:

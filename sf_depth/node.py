@@ -39,8 +39,8 @@ class DepthNode(BlockNode):
         self._source = KeyframeSource(self, landmarks=True)
         # Which frames get depth is known at once (complete), or only when they have it (posed).
         self._at_once = self.config().mode == "complete"
-        self._source.announces({"image", "camera_info", "pose", *(("depth",) if self._at_once else ())})
-        self._parts = set(COMPLETED) - {"image"} - (set() if self._source.posed else {"pose"})
+        self._source.announces({"image", "camera_info", "pose", "state", *(("depth",) if self._at_once else ())})
+        self._parts = set(COMPLETED) - {"image", "state"} - (set() if self._source.posed else {"pose"})
         for kind in self._parts:
             self.output(COMPLETED[kind])
         self.output(topics.DENSE_POINTS)

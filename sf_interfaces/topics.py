@@ -50,6 +50,7 @@ KEYFRAME_INFO = Topic("/sf/tracking/keyframe/camera_info", _INFO, Qos.KEYFRAME, 
 KEYFRAME_POSE = Topic("/sf/tracking/keyframe/pose", _POSE, Qos.KEYFRAME, "map")
 KEYFRAME_DEPTH = Topic("/sf/tracking/keyframe/depth", _IMAGE, Qos.KEYFRAME, "optical")
 KEYFRAME_LANDMARKS = Topic("/sf/tracking/keyframe/landmarks", _CLOUD, Qos.KEYFRAME, "optical")
+KEYFRAME_STATE = Topic("/sf/tracking/keyframe/state", "sf_interfaces/msg/KeyframeState", Qos.KEYFRAME, "map")
 
 DENSE_IMAGE = Topic("/sf/depth/dense/image", _IMAGE, Qos.KEYFRAME, "optical")
 DENSE_VARIANCE = Topic("/sf/depth/dense/variance", _IMAGE, Qos.KEYFRAME, "optical")

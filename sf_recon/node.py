@@ -25,7 +25,7 @@ from sf_interfaces.ros.inbox import Inbox
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.process import run
-from sf_interfaces.types import Camera, Keyframe, PointCloud
+from sf_interfaces.types import Camera, Keyframe, PointCloud, Trajectory
 from sf_recon.config import ReconConfig
 from sf_recon.core.learner import FairLock, Learner
 from sf_recon.core.reconstruction import Reconstruction
@@ -62,7 +62,7 @@ class ReconNode(BlockNode):
         saved = self.snapshot("recon.sfmap")
         self._reconstruction = Reconstruction(self.config()) if saved is None else Reconstruction.load(saved)
         self._source = KeyframeSource(self, landmarks=False)
-        self._source.announces({"image", "camera_info", "pose", "depth"})
+        self._source.announces({"image", "camera_info", "pose", "state", "depth"})
         self._unsaved, self._resumed = 0, saved is not None
         self._camera: Camera | None = None
         self._last_ns = 0
@@ -100,6 +100,7 @@ class ReconNode(BlockNode):
         """Final training, the whole surface, and the files."""
         for keyframe in self._source.end():
             self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
+        self._correct(self._source.correction())
         if self._drawer is not None:
             self._jobs.end()
             self._drawer.join()
@@ -131,6 +132,7 @@ class ReconNode(BlockNode):
         if keyframe.depth is None:
             self.health.drop("keyframe without any depth")
             return
+        self._correct(self._source.correction(keyframe.stamp_ns))
         if self._learner is None:
             with self._lock:
                 added = self._reconstruction.add(keyframe)
@@ -151,6 +153,17 @@ class ReconNode(BlockNode):
                 self._reconstruction.save(draft)
             self._source.done(keyframe.stamp_ns)
             self._unsaved = 0
+
+    def _correct(self, correction: Trajectory | None) -> None:
+        """Let the map follow corrected keyframes; a live map is then published as a whole."""
+        if correction is None:
+            return
+        with self._lock:
+            self._reconstruction.correct(correction)
+            surface = None if self._learner is None else self._reconstruction.surface()
+        self.health.count("corrections")
+        if surface is not None:
+            self._publish_surface(surface)
 
     def _publish_surface(self, cloud: PointCloud) -> None:
         placed = PointCloud(cloud.points, cloud.colors, stamp_ns=self._last_ns, frame_id="map")

@@ -15,10 +15,10 @@ from sf_interfaces.ros.bundles import TRACKED, publish_bundle
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.process import run
 from sf_interfaces.ros.sensors import SensorInputs
-from sf_interfaces.types import Float64, Frame, Scale, Trajectory
+from sf_interfaces.types import Float64, Frame, Trajectory
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.session import TrackingSession
-from sf_tracking.core.tracker import TrackingUpdate
+from sf_tracking.core.tracker import TrackingState, TrackingUpdate
 
 _PATH_EVERY_NS = 1_000_000_000
 
@@ -42,7 +42,7 @@ class TrackingNode(BlockNode):
             self.listen(topic, kind, keep)
         for topic in (topics.TRACKING_POSE, topics.TRACKING_PATH, topics.TF, *TRACKED.values()):
             self.output(topic)
-        self._next_save = 0.0
+        self._next_save, self._lost = 0.0, False
         self._begin()
         if (snapshot := self.snapshot("tracking.npz")) is not None:
             self._tracker = TrackingSession.restore(self._config, snapshot)
@@ -72,7 +72,8 @@ class TrackingNode(BlockNode):
         """Why messages were dropped and what the oldest image waits for."""
         if self.leader:
             self.health.set_drops(dict(self._inputs.assembler.reasons))
-            self.health.waiting(self._inputs.assembler.waiting_for)
+            lost = "the camera is lost and the map is kept: show it a place that it has seen before"
+            self.health.waiting(self._inputs.assembler.waiting_for or (lost if self._lost else ""))
 
     def _advance(self) -> None:
         for frame in self._inputs.assembler.ready():
@@ -83,11 +84,13 @@ class TrackingNode(BlockNode):
 
     def _track(self, frame: Frame) -> None:
         update = self._tracker.track(frame)
-        metric = update.T_map_camera is not None and update.scale is Scale.METRIC
-        self._inputs.assembler.feed_back(frame.stamp_ns, update.T_map_camera if metric else None)
+        self._inputs.assembler.feed_back(frame.stamp_ns, update.T_odom_camera)
         self.health.count("frames tracked")
         self.health.value("state", update.state.name)
         self.health.value("scale", update.scale.value)
+        if update.correction is not None:
+            self.health.count("loops closed")
+        self._lost = update.state is TrackingState.LOST
         if update.T_map_camera is not None:
             assert frame.camera is not None
             pose = messages.encode_pose(messages.rclpy_factory, update.T_map_camera, frame.stamp_ns, "map")
@@ -101,7 +104,8 @@ class TrackingNode(BlockNode):
 
     def _send_keyframes(self, update: TrackingUpdate) -> None:
         for keyframe in update.keyframes:
-            publish_bundle(self, keyframe, TRACKED, set(TRACKED))
+            correction = update.correction if keyframe is update.keyframes[-1] else None
+            publish_bundle(self, keyframe, TRACKED, set(TRACKED), correction)
             self.health.count("keyframes")
             self.sent_one(keyframe.stamp_ns)
         if update.keyframes:

@@ -10,12 +10,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from sf_interfaces.geometry.undistort import Distortion
-from sf_interfaces.io.definitions import typestore
+from sf_interfaces.io.definitions import definition, typestore
 from sf_interfaces.io.mcap_writer import McapWriter
 from sf_interfaces.ros import messages
-from sf_interfaces.types import Camera, DepthMap, Float64, PointCloud, Trajectory, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float64, PointCloud, Scale, Trajectory, UInt8
 
 _IMAGE, _INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+_STATE = "sf_interfaces/msg/KeyframeState"
 
 
 class SequenceWriter:
@@ -58,6 +59,12 @@ class SequenceWriter:
     def path(self, topic: str, stamp_ns: int, trajectory: Trajectory) -> None:
         """All poses of a trajectory as nav_msgs/Path."""
         self._write(topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns))
+
+    def keyframe_state(self, topic: str, stamp_ns: int, scale: Scale, correction: Trajectory | None) -> None:
+        """Scale of a keyframe and the poses it corrects."""
+        definition(_STATE)  # makes the type known
+        msg = messages.encode_keyframe_state(self._make, scale, stamp_ns, correction)
+        self._write(topic, _STATE, stamp_ns, msg)
 
     def camera_info(self, topic: str, stamp_ns: int, camera: Camera, distortion: Distortion | None = None) -> None:
         """Intrinsics and the lens distortion still in the image, in the camera's frame."""

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from sf_interfaces import topics
+from sf_interfaces.corrections import Corrections
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.inbox import KeyframeJoiner
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.topics import Topic
-from sf_interfaces.types import DepthMap, Keyframe, PointCloud
+from sf_interfaces.types import DepthMap, Keyframe, PointCloud, Trajectory
 
 TRACKED: dict[str, Topic] = {
     "image": topics.KEYFRAME_IMAGE,
@@ -20,6 +21,7 @@ TRACKED: dict[str, Topic] = {
     "pose": topics.KEYFRAME_POSE,
     "depth": topics.KEYFRAME_DEPTH,
     "landmarks": topics.KEYFRAME_LANDMARKS,
+    "state": topics.KEYFRAME_STATE,
 }
 COMPLETED: dict[str, Topic] = {
     "image": topics.KEYFRAME_IMAGE,
@@ -27,14 +29,21 @@ COMPLETED: dict[str, Topic] = {
     "pose": topics.DENSE_POSE,
     "depth": topics.DENSE_IMAGE,
     "variance": topics.DENSE_VARIANCE,
+    "state": topics.KEYFRAME_STATE,
 }
 
 
-def publish_bundle(node: BlockNode, keyframe: Keyframe, bundle: dict[str, Topic], parts: set[str]) -> None:
+def publish_bundle(
+    node: BlockNode,
+    keyframe: Keyframe,
+    bundle: dict[str, Topic],
+    parts: set[str],
+    correction: Trajectory | None = None,
+) -> None:
     """Publish the named parts of a keyframe on the topics of a bundle.
 
-    A keyframe without depth or landmarks sends an all-NaN image or an empty cloud, so that a bundle is
-    always complete.
+    Corrected poses of earlier keyframes, where there are any, travel in its state. A keyframe without depth or
+    landmarks sends an all-NaN image or an empty cloud, so that a bundle is always complete.
     """
     make, stamp_ns, frame = messages.rclpy_factory, keyframe.stamp_ns, keyframe.camera.frame_id
     depth = keyframe.depth
@@ -51,6 +60,7 @@ def publish_bundle(node: BlockNode, keyframe: Keyframe, bundle: dict[str, Topic]
         "landmarks": lambda: messages.encode_cloud(
             make, PointCloud(points, cloud.colors if cloud else None, stamp_ns=stamp_ns, frame_id=frame)
         ),
+        "state": lambda: messages.encode_keyframe_state(make, keyframe.scale, keyframe.stamp_ns, correction),
     }
     for kind, topic in bundle.items():
         if kind in parts:
@@ -58,11 +68,16 @@ def publish_bundle(node: BlockNode, keyframe: Keyframe, bundle: dict[str, Topic]
 
 
 class BundleInputs:
-    """Takes decoded messages of a bundle by kind and gives keyframes."""
+    """Takes decoded messages of a bundle by kind and gives keyframes.
+
+    Attributes:
+        corrections: corrected poses that came and wait for the keyframe from which on they hold.
+    """
 
     def __init__(self, bundle: dict[str, Topic], without: set[str] = frozenset()) -> None:  # type: ignore[assignment]
         self.topics = {kind: topic for kind, topic in bundle.items() if kind not in without}
         self.joiner = KeyframeJoiner(self.topics)
+        self.corrections = Corrections()
 
     def push(self, kind: str, msg: Any) -> Keyframe | None:
         """Add one message; the keyframe when its bundle is complete.
@@ -70,14 +85,17 @@ class BundleInputs:
         Raises:
             SceneFactoryError: a message is malformed or the parts do not fit together.
         """
-        parts = self.joiner.push(kind, messages.to_ns(msg.header.stamp), msg)
+        stamp_ns = messages.to_ns(msg.header.stamp)
+        if kind == "state" and (correction := messages.decode_keyframe_state(msg)[1]) is not None:
+            self.corrections.push(stamp_ns, correction)
+        parts = self.joiner.push(kind, stamp_ns, msg)
         if parts is None:
             return None
         camera, _ = messages.decode_camera_info(parts["camera_info"])
         stamp_ns, _, T = messages.decode_pose(parts["pose"])
-        depth = messages.decode_depth(parts["depth"])
-        if "variance" in parts:
-            depth = DepthMap(depth.z, messages.decode_variance(parts["variance"]))
+        scale, _ = messages.decode_keyframe_state(parts["state"])
+        variance = messages.decode_variance(parts["variance"]) if "variance" in parts else None
+        depth = DepthMap(messages.decode_depth(parts["depth"]).z, variance, scale)
         landmarks = messages.decode_cloud(parts["landmarks"]) if "landmarks" in parts else None
         image = messages.decode_image(parts["image"])
-        return Keyframe(stamp_ns, camera, image, T, depth if depth.valid.any() else None, landmarks)
+        return Keyframe(stamp_ns, camera, image, T, depth if depth.valid.any() else None, landmarks, scale)

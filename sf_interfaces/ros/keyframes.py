@@ -12,7 +12,7 @@ from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.ros.bundles import COMPLETED, TRACKED, BundleInputs, publish_bundle
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.sensors import SensorInputs
-from sf_interfaces.types import Keyframe
+from sf_interfaces.types import Keyframe, Trajectory
 
 
 class KeyframeSource:
@@ -84,6 +84,10 @@ class KeyframeSource:
     def done(self, stamp_ns: int) -> None:
         """Everything up to this keyframe is dealt with and safe: a successor of this process need not repeat it."""
         self._done.write(stamp_ns)
+
+    def correction(self, stamp_ns: int | None = None) -> Trajectory | None:
+        """Corrected poses of keyframes, to be applied before the one with this stamp (None: at the end)."""
+        return None if self._sensors is not None else self._bundles.corrections.due(stamp_ns)
 
     @property
     def reasons(self) -> dict[str, int]:

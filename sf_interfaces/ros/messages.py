@@ -27,7 +27,7 @@ from sf_interfaces.ros.images import (
     is_depth_encoding,
 )
 from sf_interfaces.ros.stamps import Factory, header, sequence, to_ns, to_stamp
-from sf_interfaces.types import Camera, Float64, Trajectory
+from sf_interfaces.types import Camera, Float64, Scale, Trajectory
 
 __all__ = [
     "COMPRESSED_IMAGE",
@@ -38,6 +38,7 @@ __all__ = [
     "decode_depth",
     "decode_field",
     "decode_image",
+    "decode_keyframe_state",
     "decode_pose",
     "decode_tf",
     "decode_variance",
@@ -45,6 +46,7 @@ __all__ = [
     "encode_cloud",
     "encode_depth",
     "encode_image",
+    "encode_keyframe_state",
     "encode_path",
     "encode_pose",
     "encode_tf",
@@ -57,6 +59,7 @@ __all__ = [
     "to_stamp",
 ]
 
+_SCALES = (Scale.METRIC, Scale.ARBITRARY)  # as sf_interfaces/KeyframeState numbers them
 StampedTransform = tuple[str, str, int, Float64]
 """(parent frame, child frame, stamp ns, T_parent_child)."""
 
@@ -215,3 +218,23 @@ def encode_path(make: Factory, trajectory: Trajectory, stamp_ns: int) -> Any:
     pairs = zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True)
     poses = [encode_pose(make, T, stamp, trajectory.frame) for stamp, T in pairs]
     return make("nav_msgs/msg/Path")(header=header(make, stamp_ns, trajectory.frame), poses=poses)
+
+
+def decode_keyframe_state(msg: Any) -> tuple[Scale, Trajectory | None]:
+    """sf_interfaces/KeyframeState -> scale, and corrected T_map_camera by stamp where it brings any.
+
+    Raises:
+        FormatError: an unknown scale, or a pose that is none.
+    """
+    if not 0 <= int(msg.scale) < len(_SCALES):
+        raise FormatError(f"keyframe state has scale {msg.scale}; this program knows 0 (metric) and 1 (arbitrary)")
+    scale, poses = _SCALES[int(msg.scale)], [decode_pose(pose) for pose in msg.corrected]
+    return scale, Trajectory.from_pairs([(stamp, T) for stamp, _, T in poses], scale) if poses else None
+
+
+def encode_keyframe_state(make: Factory, scale: Scale, stamp_ns: int, correction: Trajectory | None = None) -> Any:
+    """Scale of a keyframe, and the corrected poses of earlier ones it brings -> sf_interfaces/KeyframeState."""
+    corrected = [] if correction is None else encode_path(make, correction, stamp_ns).poses
+    return make("sf_interfaces/msg/KeyframeState")(
+        header=header(make, stamp_ns, "map"), scale=_SCALES.index(scale), corrected=corrected
+    )

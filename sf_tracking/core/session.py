@@ -1,13 +1,13 @@
-"""Tracking across what ends a tracker: a changed calibration, or the death of its process.
+"""Tracking across what a tracker does not survive: drift, loss, a changed calibration, the death of its process.
 
-The map and the trajectory go on. A tracker starts at its own origin; the session finds where that lies in
-the map, from the keyframes it remembers, and moves everything the tracker says there.
+The map and the trajectory go on. A tracker starts at its own origin; the session finds where that lies in the
+map, from the places it remembers, and moves everything the tracker says there. Where the camera comes back to a
+known place, the keyframes are corrected, and all frames with them.
 """
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import zipfile
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
@@ -16,18 +16,17 @@ import numpy as np
 
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, PointCloud, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.patches import to_gray
-from sf_tracking.core.rejoin import rejoin, view
+from sf_tracking.core import sim3, snapshot
+from sf_tracking.core.keyframe_map import KeyframeMap, Recognised
+from sf_tracking.core.places import Features, Place, features, place_of_frame, place_of_keyframe
+from sf_tracking.core.recognise import sight
 from sf_tracking.core.tracker import Tracker, TrackingState, TrackingUpdate
 
-_REMEMBERED = 4  # views of the last seconds, and as many final keyframes, to find the map by
+_VIEWS = 8  # of the last seconds, to find the map by where its newest keyframes are not final yet
 _VIEW_EVERY_NS = 1_000_000_000
-_PARTS = ("gray", "pose", "points", "camera", "stamp")  # of a remembered keyframe in a snapshot
-
-Poses = dict[int, Float64]  # stamp ns -> T_map_camera
+_HELD = 60  # keyframes of a tracker whose place is still unknown
 
 
 class TrackingSession:
@@ -35,15 +34,23 @@ class TrackingSession:
 
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
-        self._tracker = Tracker(config)
+        self._map = KeyframeMap(loops=config.loops)
+        self._views: deque[tuple[Place, Float64]] = deque(maxlen=_VIEWS)  # with their T_map_camera
+        self._poses: dict[int, Float64] = {}  # stamp ns -> T_map_camera, of trackers that have ended
+        self._T_map_odom = np.eye(4)
         self._camera: Camera | None = None
-        self._T_map_start: Float64 | None = np.eye(4)  # None: where the new tracker starts is still to be found
-        self._finals: deque[Keyframe] = deque(maxlen=_REMEMBERED)
-        self._views: deque[Keyframe] = deque(maxlen=2 * _REMEMBERED)
-        self._poses: Poses = {}  # of trackers that have ended
-        self._keyframes: Poses = {}
-        self._scale = Scale.METRIC
-        self._restored = False
+        self._near = True  # the next tracker can only start where the last one ended
+        self._begin(np.eye(4))
+
+    def _begin(self, start: Float64 | None) -> None:
+        """A new tracker; ``start`` is the similarity of its world to the map, None: to be found."""
+        self._tracker = Tracker(self._config)
+        self._start = start
+        self._anchors: list[Float64] = []  # of each of its final keyframes: the tracker's world to the map
+        self._held: deque[Keyframe] = deque(maxlen=_HELD)
+        self._hint: tuple[Float64, Recognised] | None = None  # a start that waits for a second sighting
+        self._sighted: int | None = None  # stamp of the keyframe that was looked for last
+        self._lost = 0  # frames in a row
 
     def track(self, frame: Frame) -> TrackingUpdate:
         """Pose of the next frame; see :meth:`Tracker.track`.
@@ -51,116 +58,177 @@ class TrackingSession:
         Raises:
             FormatError: the frame has no image or camera, or its stamp does not increase.
         """
+        if frame.image is None or frame.camera is None:
+            raise FormatError("tracking needs an image and its camera_info in every frame")
         ended: tuple[Keyframe, ...] = ()
-        if self._camera is not None and frame.camera is not None and frame.camera != self._camera:
-            ended = self._succeed()
+        changed = self._camera is not None and frame.camera != self._camera
+        if changed or (self._lost >= self._config.patience and len(self._map)):
+            ended = self._succeed(near=changed)
         self._camera = frame.camera
-        update = self._rejoin(frame) if self._T_map_start is None else self._placed(self._tracker.track(frame))
+        update = self._tracker.track(frame)
+        self._lost = self._lost + 1 if update.state is TrackingState.LOST else 0
+        update = self._placed(update, ended) if self._start is not None else self._search(frame, update, ended)
         self._look(frame, update.T_map_camera)
-        return replace(update, keyframes=(*ended, *update.keyframes)) if ended else update
+        return update
 
     def finish(self) -> TrackingUpdate:
         """End of the input: every keyframe still in the window becomes final."""
-        return self._placed(self._tracker.finish()) if self._T_map_start is not None else self._lost(0)
+        update = self._tracker.finish()
+        return self._placed(update, (), end=True) if self._start is not None else self._unknown(update, ())
 
     def trajectory(self) -> Trajectory:
-        """T_map_camera of every tracked frame, also those before a restart."""
+        """T_map_camera of every tracked frame, corrected, also those before a restart."""
         poses = dict(self._poses)
-        if self._T_map_start is not None:
-            own = self._tracker.trajectory()
-            self._scale = own.scale
-            poses |= {t: self._T_map_start @ T for t, T in zip(own.stamps_ns.tolist(), own.poses, strict=True)}
-        return Trajectory.from_pairs(list(poses.items()), self._scale)
+        if self._start is not None and len(own := self._tracker.trajectory()):
+            # A frame moves with the last final keyframe before it; those after the newest move as the tracker does.
+            finals = self._tracker.keyframe_trajectory().stamps_ns
+            finals = finals[len(finals) - len(self._anchors) :]
+            owner = np.maximum(np.searchsorted(finals, own.stamps_ns, side="right") - 1, 0)
+            owner[own.stamps_ns > (finals[-1] if len(finals) else -1)] = len(finals)
+            S = np.array([*self._anchors, self._start])[owner]
+            poses |= dict(zip(own.stamps_ns.tolist(), sim3.rigid(S @ own.poses), strict=True))
+        return Trajectory.from_pairs(list(poses.items()), self._map.scale)
 
     def keyframe_trajectory(self) -> Trajectory:
-        """T_map_camera of the final keyframes, also those before a restart."""
-        return Trajectory.from_pairs(list(self._keyframes.items()), self._scale)
+        """T_map_camera of the final keyframes, corrected, also those before a restart."""
+        return Trajectory.from_pairs(list(self._map.poses().items()), self._map.scale)
 
-    # ---- succession of trackers
+    # ---- a tracker whose place is known
 
-    def _succeed(self) -> tuple[Keyframe, ...]:
-        """The calibration has changed: this tracker ends, another goes on in the same map."""
+    def _placed(
+        self, update: TrackingUpdate, ended: tuple[Keyframe, ...], found: Recognised | None = None, *, end: bool = False
+    ) -> TrackingUpdate:
+        """The update in the map's frame; its keyframes enter the map, and loops take effect."""
+        start = self._start
+        assert start is not None
+        if not len(self._map):
+            self._map.scale = update.scale
+        keyframes = tuple(self._moved(keyframe) for keyframe in update.keyframes)
+        for keyframe in keyframes:
+            self._map.add(keyframe, found)
+            self._anchors.append(start)
+            found = None
+        if end:
+            self._map.complete()
+        elif not keyframes:
+            self._map.work()
+        correction = self._correct() if keyframes else None
+        if correction is not None:
+            keyframes = (*keyframes[:-1], replace(keyframes[-1], T_map_camera=correction.poses[-1]))
+        T = None if update.T_map_camera is None else sim3.rigid(self._start @ update.T_map_camera)
+        return replace(
+            update,
+            keyframes=(*ended, *keyframes),
+            T_map_camera=T,
+            scale=self._map.scale,
+            correction=correction,
+            T_map_odom=self._T_map_odom,
+        )
+
+    def _moved(self, keyframe: Keyframe) -> Keyframe:
+        """A keyframe of the tracker in the map's frame and unit."""
+        S = self._start @ keyframe.T_map_camera
+        cloud, unit = keyframe.landmarks, float(sim3.scale_of(S))
+        if cloud is not None and unit != 1.0:
+            cloud = PointCloud(cloud.points * np.float32(unit), cloud.colors, None, cloud.stamp_ns, cloud.frame_id)
+        return replace(keyframe, T_map_camera=sim3.rigid(S), landmarks=cloud, scale=self._map.scale)
+
+    def _correct(self) -> Trajectory | None:
+        """Let loops take effect on everything that has a place; the corrected keyframes, None without any."""
+        motion = self._map.correct()
+        if motion is None:
+            return None
+        stamps = np.array(self._map.stamps)
+        own = len(self._anchors)
+        self._anchors = list(motion[len(motion) - own :] @ np.array(self._anchors))
+        self._start = motion[-1] @ self._start
+        self._T_map_odom = sim3.rigid(motion[-1] @ self._T_map_odom)
+        if self._poses:
+            owner = np.maximum(np.searchsorted(stamps, list(self._poses), side="right") - 1, 0)
+            self._poses = dict(
+                zip(self._poses, sim3.rigid(motion[owner] @ np.array(list(self._poses.values()))), strict=True)
+            )
+        self._views = deque(((place, sim3.rigid(motion[-1] @ T)) for place, T in self._views), maxlen=_VIEWS)
+        return self.keyframe_trajectory()
+
+    # ---- a tracker whose place is still to be found
+
+    def _succeed(self, *, near: bool) -> tuple[Keyframe, ...]:
+        """This tracker ends, another goes on in the same map.
+
+        Args:
+            near: the camera is where it was, so the last pose serves where no image of the map is recognised.
+                Without a metric scale the new tracker measures in another unit then, until a loop tells it.
+        """
         ended = self.finish().keyframes
-        trajectory = self.trajectory()
-        self._poses = dict(zip(trajectory.stamps_ns.tolist(), trajectory.poses, strict=True))
-        self._tracker = Tracker(self._config)
-        self._T_map_start = self._start()
+        self._poses = dict(zip((known := self.trajectory()).stamps_ns.tolist(), known.poses, strict=True))
+        self._near = near
+        last = self._poses[max(self._poses)] if self._poses else np.eye(4)
+        self._begin(last if not self._poses or (near and self._map.scale is Scale.ARBITRARY) else None)
         return ended
 
-    def _start(self) -> Float64 | None:
-        """Where a new tracker starts in the map; None: to be found.
+    def _search(self, frame: Frame, update: TrackingUpdate, ended: tuple[Keyframe, ...]) -> TrackingUpdate:
+        """Look for the frame in the map; what the tracker found out so far is placed with it."""
+        self._held.extend(update.keyframes)
+        found = None if update.T_map_camera is None else self._found(frame, update)
+        if found is None:
+            return self._unknown(update, ended)
+        start, recognised = found
+        held = (*self._held,)
+        self._start, self._held = start, deque(maxlen=_HELD)
+        return self._placed(replace(update, keyframes=held), ended, recognised)
 
-        Without a metric scale a new tracker measures in another unit, and no image of the map tells which:
-        it goes on from the last pose, and its part of the map has its own scale.
-        """
-        if not self._poses:
-            return np.eye(4)
-        return None if self._scale is Scale.METRIC else self._poses[max(self._poses)]
+    def _found(self, frame: Frame, update: TrackingUpdate) -> tuple[Float64, Recognised | None] | None:
+        """Where the tracker's world lies in the map, and the place that tells it."""
+        assert frame.image is not None and frame.camera is not None and update.T_map_camera is not None
+        metric = self._map.scale is Scale.METRIC
+        back = se3.inverse(update.T_map_camera)
+        if metric:
+            seen = features(frame.image)
+            if (T := self._among_views(seen, frame.camera)) is not None:
+                return T @ back, None
+            recognised = self._map.recognise(seen, frame.camera)
+            depth = 0.0 if recognised is None else self._map.places[recognised.index].depth
+        else:
+            keyframe = self._tracker.newest_keyframe()
+            if keyframe is None or keyframe.stamp_ns == self._sighted:
+                return None
+            self._sighted, back = keyframe.stamp_ns, se3.inverse(keyframe.T_map_camera)
+            seen = features(keyframe.image)
+            place = place_of_keyframe(keyframe, seen)
+            recognised, depth = self._map.recognise(seen, frame.camera, place), place.depth
+        if recognised is None:
+            return (self._poses[max(self._poses)] @ back, None) if self._near and metric else None
+        start = recognised.S @ back
+        hint, self._hint = self._hint, (start, recognised)
+        if self._near or (hint is not None and self._map.agree(hint[0] @ se3.inverse(back), recognised.S, depth)):
+            return start, recognised
+        return None
 
-    def _rejoin(self, frame: Frame) -> TrackingUpdate:
-        """Find the frame in the map; the tracker starts with the first that is found and can start it."""
-        T = self._found(frame)
-        if T is None:
-            return self._lost(frame.stamp_ns)
-        tracker = Tracker(self._config)
-        update = tracker.track(frame)
-        if update.T_map_camera is None:
-            return update
-        self._tracker, self._T_map_start = tracker, T @ se3.inverse(update.T_map_camera)
-        return self._placed(update)
+    def _among_views(self, seen: Features, camera: Camera) -> Float64 | None:
+        """T_map_camera of an image that shows what was seen in the last seconds."""
+        if not self._views:
+            return None
+        sighting = sight([p for p, _ in self._views], np.array([T for _, T in self._views]), seen, camera)
+        return None if sighting is None else sighting.T
 
-    def _found(self, frame: Frame) -> Float64 | None:
-        """T_map_camera by the remembered keyframes; of a camera that merely changed its lens, the last pose serves."""
-        if frame.image is None or frame.camera is None:
-            raise FormatError("tracking needs an image and its camera_info in every frame")
-        T = rejoin([*self._views, *self._finals], frame.image, frame.camera)
-        if T is not None or self._restored:
-            return T
-        return self._poses[max(self._poses)]
+    def _unknown(self, update: TrackingUpdate, ended: tuple[Keyframe, ...]) -> TrackingUpdate:
+        """Nothing can be said in the map's frame."""
+        return TrackingUpdate(update.stamp_ns, None, TrackingState.LOST, ended, self._map.scale)
 
     def _look(self, frame: Frame, T_map_camera: Float64 | None) -> None:
         """Remember a tracked frame now and then."""
-        if T_map_camera is None or (self._views and frame.stamp_ns - self._views[-1].stamp_ns < _VIEW_EVERY_NS):
+        if T_map_camera is None or (self._views and frame.stamp_ns - self._views[-1][0].stamp_ns < _VIEW_EVERY_NS):
             return
-        if (seen := view(frame, T_map_camera)) is not None:
-            self._views.append(seen)
-
-    def _lost(self, stamp_ns: int) -> TrackingUpdate:
-        return TrackingUpdate(stamp_ns, None, TrackingState.LOST, scale=self._scale)
-
-    def _placed(self, update: TrackingUpdate) -> TrackingUpdate:
-        """The update in the map's frame; its keyframes are remembered."""
-        start = self._T_map_start
-        assert start is not None
-        self._scale = update.scale
-        moved = tuple(replace(k, T_map_camera=start @ k.T_map_camera) for k in update.keyframes)
-        self._finals.extend(moved)
-        self._keyframes |= {k.stamp_ns: k.T_map_camera for k in moved}
-        T = None if update.T_map_camera is None else start @ update.T_map_camera
-        return replace(update, keyframes=moved, T_map_camera=T)
+        if (place := place_of_frame(frame)) is not None:
+            self._views.append((place, T_map_camera))
 
     # ---- snapshots
 
     def save(self, path: Path) -> None:
-        """Write what a successor process needs: the trajectory and the remembered keyframes, without pickle."""
-        trajectory, keyframes = self.trajectory(), self.keyframe_trajectory()
-        arrays: dict[str, np.ndarray] = {
-            "version": np.array(1),
-            "metric": np.array(self._scale is Scale.METRIC),
-            "stamps": trajectory.stamps_ns,
-            "poses": trajectory.poses,
-            "keyframe_stamps": keyframes.stamps_ns,
-            "keyframe_poses": keyframes.poses,
-        }
-        for i, k in enumerate([*self._finals, *self._views]):
-            camera = k.camera
-            arrays[f"{i}.gray"] = to_gray(k.image)
-            arrays[f"{i}.pose"] = k.T_map_camera
-            arrays[f"{i}.points"] = _landmarks(k)
-            arrays[f"{i}.camera"] = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-            arrays[f"{i}.stamp"] = np.array(k.stamp_ns)
-        with replace_file(path) as draft, draft.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+        """Write what a successor process needs: the trajectory, the map of keyframes and its places, no pickle."""
+        trajectory = self.trajectory()
+        snapshot.write(path, self._map, trajectory, list(self._views))
 
     @staticmethod
     def restore(config: TrackingConfig, path: Path) -> TrackingSession:
@@ -170,26 +238,8 @@ class TrackingSession:
             FormatError: not a snapshot.
         """
         out = TrackingSession(config)
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                a = {name: file[name] for name in file.files}
-            out._scale = Scale.METRIC if a["metric"] else Scale.ARBITRARY
-            out._poses = dict(zip(a["stamps"].tolist(), a["poses"], strict=True))
-            out._keyframes = dict(zip(a["keyframe_stamps"].tolist(), a["keyframe_poses"], strict=True))
-            for i in range(sum(name.endswith(".gray") for name in a)):
-                out._views.append(_keyframe({k: a[f"{i}.{k}"] for k in _PARTS}))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-            raise FormatError(f"{path} is no snapshot of the tracker ({error}); delete it and start anew") from error
-        out._T_map_start, out._restored = out._start(), True
+        out._poses, views = snapshot.read(path, out._map)
+        out._views.extend(views)
+        out._near = False
+        out._begin(None if out._poses else np.eye(4))
         return out
-
-
-def _keyframe(a: dict[str, np.ndarray]) -> Keyframe:
-    height, width = a["gray"].shape
-    camera = Camera(width, height, *(float(v) for v in a["camera"]))
-    return Keyframe(int(a["stamp"]), camera, a["gray"], a["pose"], None, PointCloud(a["points"].astype(np.float32)))
-
-
-def _landmarks(keyframe: Keyframe) -> Float64:
-    """Landmarks of a keyframe, [N, 3], optical frame."""
-    return np.zeros((0, 3)) if keyframe.landmarks is None else keyframe.landmarks.points.astype(np.float64)

@@ -42,6 +42,9 @@ class TrackingUpdate:
         keyframes: those whose pose became final with this frame, oldest first.
         scale: ARBITRARY where the map began without depth.
         edges: observations used for the pose; inliers: those that agree with it.
+        correction: corrected T_map_camera of all final keyframes, where a loop was closed; ``keyframes`` that are
+            not the last of this update still have the pose from before it.
+        T_map_odom: what loops have corrected so far.
     """
 
     stamp_ns: int
@@ -51,6 +54,15 @@ class TrackingUpdate:
     scale: Scale = Scale.METRIC
     edges: int = 0
     inliers: int = 0
+    correction: Trajectory | None = None
+    T_map_odom: Float64 | None = None
+
+    @property
+    def T_odom_camera(self) -> Float64 | None:
+        """The pose in metres that no correction makes jump; None while lost or without a metric scale."""
+        if self.T_map_camera is None or self.scale is not Scale.METRIC:
+            return None
+        return self.T_map_camera if self.T_map_odom is None else se3.inverse(self.T_map_odom) @ self.T_map_camera
 
 
 class Tracker:
@@ -114,6 +126,10 @@ class Tracker:
     def keyframe_trajectory(self) -> Trajectory:
         """T_map_camera of the final keyframes."""
         return Trajectory.from_pairs(list(self._final.items()), self.scale)
+
+    def newest_keyframe(self) -> Keyframe | None:
+        """The newest keyframe as it is now, still under optimisation; None before the map exists."""
+        return self._window.keyframes[-1].final(self.scale) if len(self._window) else None
 
     # ---- the steps
 

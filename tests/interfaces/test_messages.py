@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from rosbags.typesys import Stores, get_typestore
 
+from sf_interfaces.corrections import Corrections
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.undistort import undistort_depth, undistort_image
+from sf_interfaces.io.definitions import definition, typestore
 from sf_interfaces.ros import messages as m
-from sf_interfaces.types import Camera, DepthMap, PointCloud, Trajectory
+from sf_interfaces.types import Camera, DepthMap, PointCloud, Scale, Trajectory
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP = 1_700_000_000_123_456_789
@@ -352,3 +354,33 @@ def test_bad_quaternions_and_stamps() -> None:
     for ns in (-1, 2**31 * 10**9):
         with pytest.raises(FormatError, match="stamp"):
             m.to_stamp(make, ns)
+
+
+@pytest.mark.parametrize("scale", list(Scale))
+def test_a_keyframe_says_its_scale_and_what_it_corrects(scale: Scale) -> None:
+    name = "sf_interfaces/msg/KeyframeState"
+    assert definition(name) is not None
+    store = typestore()
+    correction = Trajectory(np.array([5, 10**9, STAMP]), se3.exp(np.random.default_rng(0).normal(0, 1, (3, 6))), scale)
+    for sent in (None, correction):
+        msg = m.encode_keyframe_state(lambda kind: store.types[kind], scale, STAMP, sent)
+        got, back = m.decode_keyframe_state(store.deserialize_cdr(store.serialize_cdr(msg, name), name))
+        assert got is scale and m.to_ns(msg.header.stamp) == STAMP
+        assert (back is None) == (sent is None)
+    assert back is not None and back.scale is scale
+    np.testing.assert_array_equal(back.stamps_ns, correction.stamps_ns)
+    np.testing.assert_allclose(back.poses, correction.poses, atol=1e-12)
+    with pytest.raises(FormatError, match="scale 7"):
+        m.decode_keyframe_state(dataclasses.replace(msg, scale=7))
+
+
+def test_corrections_wait_for_their_keyframe() -> None:
+    waiting = Corrections()
+    first, second = (Trajectory(np.array([k]), np.eye(4)[None]) for k in (1, 2))
+    waiting.push(20, first)
+    assert waiting.due(19) is None and waiting.due(20) is first and waiting.due(20) is None
+    waiting.push(30, first)
+    waiting.push(40, second)
+    assert waiting.due(50) is second, "the newest replaces older ones"
+    waiting.push(60, first)
+    assert waiting.due() is first

@@ -14,7 +14,8 @@ from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, DepthMap, Frame
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.rejoin import rejoin, view
+from sf_tracking.core.places import features, place_of_frame
+from sf_tracking.core.recognise import sight
 from sf_tracking.core.session import TrackingSession
 from sf_tracking.core.tracker import Tracker, TrackingState
 
@@ -98,14 +99,14 @@ def test_a_changed_calibration_goes_on_in_the_same_map(walk: tuple[list[Frame], 
     assert len(session.trajectory()) > CUT
 
 
-def test_a_view_needs_depth_and_rejoins_its_own_image(walk: tuple[list[Frame], list[np.ndarray]]) -> None:
+def test_a_view_needs_depth_and_finds_its_own_image(walk: tuple[list[Frame], list[np.ndarray]]) -> None:
     frame = walk[0][3]
     assert frame.image is not None and frame.camera is not None
-    assert view(replace(frame, depth=None), np.eye(4)) is None
-    seen = view(frame, np.eye(4))
+    assert place_of_frame(replace(frame, depth=None)) is None
+    seen = place_of_frame(frame)
     assert seen is not None
-    found = rejoin([seen], frame.image, frame.camera)
-    assert found is not None and np.abs(found - np.eye(4)).max() < 0.02
+    found = sight([seen], np.eye(4)[None], features(frame.image), frame.camera)
+    assert found is not None and np.abs(found.T - np.eye(4)).max() < 0.02
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 damaged", b"{}"])

@@ -1,0 +1,235 @@
+"""The map of final keyframes: where they lie, what ties them together, and by what they are found again.
+
+A keyframe is looked for among the older ones when it has become final. The search is done in parts, one per
+frame, so that tracking never waits for it; a loop it finds takes effect with the next keyframe.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from sf_interfaces.types import Camera, Float64, Keyframe, Scale
+from sf_tracking.core import sim3
+from sf_tracking.core.places import Features, Index, Place, features, place_of_keyframe
+from sf_tracking.core.pose_graph import Edges, optimise
+from sf_tracking.core.recognise import Sighting, sight
+
+_NEIGHBOURS = 15  # latest keyframes that are no loop
+_CANDIDATES = 3  # places that are verified
+_APART = 5  # keyframes between two of them
+_ALIKE = 1.4  # score of a candidate relative to the median
+_ODOMETRY_PX = 0.5  # what a relative pose between neighbours errs by, as displacement of its landmarks
+_ODOMETRY_STRETCH, _LOOP_STRETCH = 0.005, 0.02  # and its unit, and that of a loop
+_NEWS = 3.0  # deviations from which on a loop tells anything that the map does not know
+_SAME_PLACE = (0.04, 0.04, 0.15)  # two sightings agree: share of the depth, rad, log of scale
+_WITHIN = 3  # keyframes after the first sighting in which a second one has to confirm it
+_PLAUSIBLE = {Scale.METRIC: 0.05, Scale.ARBITRARY: 0.25}  # drift per path that a loop may ask for
+_TURN, _STRETCH = 0.35, 0.7  # rad and log of scale that it may ask for
+
+
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """A view found again: near keyframe number ``index``, at S in the map (scale: its unit in the map's).
+
+    Args:
+        sigma: [7] deviations of S in its own frame (m, rad, log of scale).
+        inliers: corners of the view that agree.
+    """
+
+    index: int
+    S: Float64
+    sigma: Float64
+    inliers: int
+
+
+class KeyframeMap:
+    """Final keyframes with poses that loops correct.
+
+    Attributes:
+        scale: METRIC: relative poses are rigid; ARBITRARY: the unit may drift along the way, and loops find it.
+        stamps: of the keyframes, ns.
+        S: [N, 4, 4] similarities: from a keyframe's optical frame, in the unit it was published in, to the map.
+    """
+
+    def __init__(self, *, loops: bool = True) -> None:
+        self.scale = Scale.METRIC
+        self.stamps: list[int] = []
+        self.S: Float64 = np.zeros((0, 4, 4))
+        self.places: list[Place] = []
+        self.edges: list[tuple[int, int, Float64, Float64, bool]] = []  # i, j, Z, sigma, closes a loop
+        self._loops = loops
+        self._index = Index()
+        self._walked: list[float] = []  # length of the path up to each keyframe
+        self._parts: Iterator[None] = iter(())
+        self._hint: Recognised | None = None  # a loop that waits for a second sighting
+        self._hinted = 0  # keyframe that saw it
+        self._news = False
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def add(self, keyframe: Keyframe, found: Recognised | None = None) -> None:
+        """One more final keyframe.
+
+        Args:
+            found: what ties it to the map where it does not follow the last keyframe.
+        """
+        self.complete()
+        n, T = len(self), keyframe.T_map_camera
+        self.stamps.append(keyframe.stamp_ns)
+        self.S = np.concatenate([self.S, T[None]])
+        step = float(np.linalg.norm(self.S[n, :3, 3] - self.S[n - 1, :3, 3])) if n else 0.0
+        self._walked.append((self._walked[-1] if n else 0.0) + step)
+        if found is not None:
+            self._tie(found.index, n, T, found.sigma, loop=True)
+        elif n:
+            self._tie(n - 1, n, T, _odometry_sigma(keyframe), loop=False)
+        self._parts = self._search(keyframe, n)
+
+    def work(self) -> bool:
+        """Do the next part of the search for a loop; True when nothing is left."""
+        return next(self._parts, self) is self
+
+    def complete(self) -> None:
+        """Do all that is left."""
+        while not self.work():
+            pass
+
+    def correct(self) -> Float64 | None:
+        """Let the loops found so far take effect.
+
+        Returns:
+            Motion of each keyframe within the map, [N, 4, 4] similarities; None where nothing changes.
+        """
+        if not self._news:
+            return None
+        self._news, self._hint = False, None
+        before = self.S
+        self.S, _ = optimise(before, self._graph(), with_scale=self.scale is Scale.ARBITRARY)
+        return self.S @ sim3.inverse(before)
+
+    def recognise(self, found: Features, camera: Camera, own: Place | None = None) -> Recognised | None:
+        """Where in the whole map an image is, or None.
+
+        Args:
+            own: the image's own landmarks, from which its unit is told; None: it has the map's unit.
+        """
+        self.complete()
+        out: list[Recognised] = []
+        for index in self._candidates(self._index.scores(found.descriptors)):
+            out += self._verified(index, found, camera, own)
+        return self._unambiguous(out)
+
+    def agree(self, a: Float64, b: Float64, depth: float) -> bool:
+        """Whether two similarities put a camera that looks ``depth`` far to the same place."""
+        r, _ = sim3.coordinates(sim3.inverse(a) @ b)
+        share, turn, stretch = _SAME_PLACE
+        return bool(np.linalg.norm(r[:3]) < share * depth and np.linalg.norm(r[3:6]) < turn and np.abs(r[6]) < stretch)
+
+    # ---- the search for a loop
+
+    def _search(self, keyframe: Keyframe, n: int) -> Iterator[None]:
+        found = features(keyframe.image)
+        place = place_of_keyframe(keyframe, found)
+        yield
+        scores = self._index.scores(place.descriptors)
+        self._index.add(place.descriptors)
+        self.places.append(place)
+        if not self._loops or n <= _NEIGHBOURS:
+            return
+        yield
+        own = place if self.scale is Scale.ARBITRARY else None
+        out: list[Recognised] = []
+        for index in self._candidates(scores[: n - _NEIGHBOURS]):
+            out += self._verified(index, found, keyframe.camera, own)
+            yield
+        loop = self._unambiguous(out)
+        if loop is not None and self._plausible(loop, n):
+            self._consider(loop, n)
+
+    def _candidates(self, scores: Float64) -> list[int]:
+        """Numbers of the places that resemble the view, the best first."""
+        if not len(scores):
+            return []
+        least, left, out = _ALIKE * np.median(scores), scores.copy(), []
+        for _ in range(_CANDIDATES):
+            best = int(np.argmax(left))
+            if left[best] <= (least if len(scores) > 2 * _NEIGHBOURS else 0.0):
+                break
+            out.append(best)
+            left[max(0, best - _APART) : best + _APART + 1] = 0.0
+        return out
+
+    def _verified(self, index: int, found: Features, camera: Camera, own: Place | None) -> list[Recognised]:
+        """The view as the keyframes round ``index`` see it: one result or none."""
+        around = [i for i in (index - 1, index, index + 1) if 0 <= i < len(self.places)]
+        seen: Sighting | None = sight([self.places[i] for i in around], self.S[around], found, camera)
+        unit = 1.0 if own is None or seen is None else seen.unit(own)
+        if seen is None or unit is None:
+            return []
+        sigma = np.r_[seen.sigma, _LOOP_STRETCH]
+        return [Recognised(index, sim3.similarity(seen.T, unit), sigma, seen.inliers)]
+
+    def _unambiguous(self, found: list[Recognised]) -> Recognised | None:
+        """The best of some results, unless another contradicts it: then two places look alike."""
+        if not found:
+            return None
+        best = max(found, key=lambda r: r.inliers)
+        depth = self.places[best.index].depth
+        return best if all(self.agree(best.S, other.S, depth) for other in found) else None
+
+    def _plausible(self, loop: Recognised, n: int) -> bool:
+        """A loop may only ask for as much drift as the way since then explains."""
+        r, _ = sim3.coordinates(sim3.inverse(self.S[n]) @ loop.S)
+        way = self._walked[n] - self._walked[loop.index]
+        most = _PLAUSIBLE[self.scale] * way + 0.1 * self.places[n].depth
+        return bool(np.linalg.norm(r[:3]) < most and np.linalg.norm(r[3:6]) < _TURN and np.abs(r[6]) < _STRETCH)
+
+    def _consider(self, loop: Recognised, n: int) -> None:
+        """Take a loop that tells something new, once a second sighting has confirmed it."""
+        place = self.places[n]
+        Z = sim3.inverse(self.S[loop.index]) @ loop.S
+        r, _ = sim3.coordinates(sim3.inverse(Z) @ sim3.inverse(self.S[loop.index]) @ self.S[n])
+        if np.abs(r / loop.sigma).max() < _NEWS:
+            self._hint = None
+            return
+        hint = self._hint if n - self._hinted <= _WITHIN else None
+        if hint is not None:
+            expected = hint.S @ sim3.inverse(self.S[self._hinted]) @ self.S[n]
+            if self.agree(expected, loop.S, place.depth * float(sim3.scale_of(loop.S))):
+                for seen, at in ((hint, self._hinted), (loop, n)):
+                    self._tie(seen.index, at, seen.S, seen.sigma, loop=True)
+                self._news = True
+        self._hint, self._hinted = loop, n
+
+    # ---- the graph
+
+    def _tie(self, i: int, j: int, S_j: Float64, sigma: Float64, *, loop: bool) -> None:
+        self.edges.append((i, j, sim3.inverse(self.S[i]) @ S_j, sigma, loop))
+
+    def _graph(self) -> Edges:
+        i, j, Z, sigma, loop = (list(part) for part in zip(*self.edges, strict=True))
+        return Edges(np.array(i), np.array(j), np.array(Z), np.array(sigma), np.array(loop, dtype=bool))
+
+    def restore(self, stamps: list[int], S: Float64, places: list[Place], edges: list[tuple]) -> None:  # type: ignore[type-arg]
+        """Take over the content of a map that was saved."""
+        self.stamps, self.S, self.places, self.edges = stamps, S, places, edges
+        steps = np.linalg.norm(np.diff(S[:, :3, 3], axis=0), axis=1)
+        self._walked = np.r_[0.0, np.cumsum(steps)].tolist() if len(stamps) else []
+        for place in places:
+            self._index.add(place.descriptors)
+
+    def poses(self) -> dict[int, Float64]:
+        """T_map_camera of every keyframe, by stamp."""
+        return dict(zip(self.stamps, sim3.rigid(self.S), strict=True)) if self.stamps else {}
+
+
+def _odometry_sigma(keyframe: Keyframe) -> Float64:
+    """Deviations [7] of the pose of a keyframe relative to the one before: a displacement of its landmarks in px."""
+    cloud, turn = keyframe.landmarks, _ODOMETRY_PX / keyframe.camera.fx
+    depth = 1.0 if cloud is None or not len(cloud) else float(np.median(cloud.points[:, 2]))
+    return np.array([*[turn * depth] * 3, *[turn] * 3, _ODOMETRY_STRETCH])
