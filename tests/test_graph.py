@@ -18,8 +18,10 @@ from mcap.reader import make_reader
 
 from sf_bringup.simulate import SimulationSpec, simulate
 from sf_interfaces.io.bag import BagReader
+from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.ros.messages import decode_depth, to_ns
+from tests.tracking.box_room import CAMERA, BoxRoom, circle, warming_up
 
 pytestmark = [pytest.mark.graph, pytest.mark.timeout(900)]
 FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.pixels=1024"]
@@ -89,6 +91,56 @@ def test_lossless_graph_equals_the_process_and_itself(bag: Path, environment: di
     inproc, ros = read_tum(outs[0] / "trajectory.tum"), read_tum(outs[1] / "trajectory.tum")
     np.testing.assert_array_equal(inproc.stamps_ns, ros.stamps_ns)
     np.testing.assert_allclose(inproc.poses, ros.poses, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def loop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A walk back to where it began, with depth that makes the tracker drift."""
+    path = tmp_path_factory.mktemp("graph") / "loop.mcap"
+    room, poses = BoxRoom(3), circle(90, 72, 1.2)
+    frames = warming_up([room.frame(i, T, "dense") for i, T in enumerate(poses)], 18, 54)
+    with SequenceWriter(path) as writer:
+        for frame in frames:
+            assert frame.image is not None and frame.depth is not None
+            writer.image("/camera/color/image_raw", frame.stamp_ns, frame.image, CAMERA.frame_id)
+            writer.camera_info("/camera/color/camera_info", frame.stamp_ns, CAMERA)
+            writer.depth("/camera/depth/image_raw", frame.stamp_ns, frame.depth, CAMERA.frame_id, "32FC1")
+    return path
+
+
+def test_a_loop_corrects_the_map_alike_in_both_engines(loop: Path, environment: dict[str, str], tmp_path: Path) -> None:
+    outs = [tmp_path / name for name in ("inproc", "ros")]
+    for out in outs:
+        args = ("--goal", "recon", "--engine", out.name, "--out", str(out), *FAST, "--set", "tracking.window=5")
+        done = sf(environment, "run", str(loop), *args)
+        assert done.returncode == 0, done.stderr
+    corrected = [_corrections(out) for out in outs]
+    assert corrected[0] and corrected[0] == corrected[1], "(stamp of the keyframe, number of poses) of each correction"
+    for name in ("trajectory.tum", "keyframes.tum"):
+        inproc, ros = (read_tum(out / name) for out in outs)
+        np.testing.assert_array_equal(inproc.stamps_ns, ros.stamps_ns)
+        np.testing.assert_allclose(inproc.poses, ros.poses, atol=1e-6)
+    maps = [SavedPoses(out / "map.sfmap") for out in outs]
+    np.testing.assert_allclose(maps[0].poses, maps[1].poses, atol=1e-6)
+    np.testing.assert_allclose(maps[0].points, maps[1].points, atol=1e-4)
+    final = read_tum(outs[0] / "keyframes.tum")
+    np.testing.assert_allclose(maps[0].poses, final.poses, atol=1e-6, err_msg="the map has followed the keyframes")
+
+
+def _corrections(out: Path) -> list[tuple[int, int]]:
+    with BagReader(out / "result.mcap") as result:
+        states = [(raw.stamp_ns, result.decode(raw)) for raw in result.messages(["/sf/tracking/keyframe/state"])]
+    return [(to_ns(msg.header.stamp), len(msg.corrected)) for _, msg in states if len(msg.corrected)]
+
+
+class SavedPoses:
+    """Keyframe poses and finest points of a map file."""
+
+    def __init__(self, path: Path) -> None:
+        with np.load(path, allow_pickle=False) as file:
+            order = np.argsort(file["keyframe.stamps"])
+            self.poses = file["keyframe.poses"][order]
+            self.points = file["level0.points"]
 
 
 def test_rgbl_graph_records_everything_for_every_keyframe(

@@ -22,7 +22,7 @@ _MIN_INLIERS = 30  # different corners of the image; fewer were seen to agree on
 _MIN_SHARE = 0.4  # of the matched corners
 _MIN_SEEN = 0.1  # of the places' points that the image should show and of its corners there
 _CELLS, _MIN_CELLS = 4, 4  # the image has 4 x 4 cells; the inliers lie in so many of them at least
-_SCALE_PX = 6.0  # a corner takes the depth of a landmark of its image this near
+_NEAR = 0.03  # of the image width: a corner takes the depth of a landmark of its image this near
 _MIN_SCALED = 10  # corners with such a depth, from which the ratio of two units is known
 _PNP = cv2.SOLVEPNP_EPNP
 _CORNER_PX, _INDEPENDENT = 0.7, 100  # deviation of a corner, and how many of them err independently
@@ -56,7 +56,7 @@ class Sighting:
         if distance.size == 0:
             return None
         nearest = np.argmin(distance, axis=1)
-        near = distance[np.arange(len(z)), nearest] < _SCALE_PX
+        near = distance[np.arange(len(z)), nearest] < _NEAR * own.camera.width
         ratios = z[near] / own.points[nearest[near], 2]
         return float(np.median(ratios)) if near.sum() >= _MIN_SCALED else None
 

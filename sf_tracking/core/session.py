@@ -21,7 +21,7 @@ from sf_tracking.config import TrackingConfig
 from sf_tracking.core import sim3, snapshot
 from sf_tracking.core.keyframe_map import KeyframeMap, Recognised
 from sf_tracking.core.places import Features, Place, features, place_of_frame, place_of_keyframe
-from sf_tracking.core.recognise import sight
+from sf_tracking.core.recognise import Sighting, sight
 from sf_tracking.core.tracker import Tracker, TrackingState, TrackingUpdate
 
 _VIEWS = 8  # of the last seconds, to find the map by where its newest keyframes are not final yet
@@ -185,12 +185,12 @@ class TrackingSession:
         back = se3.inverse(update.T_map_camera)
         if metric:
             seen = features(frame.image)
-            if (T := self._among_views(seen, frame.camera)) is not None:
-                return T @ back, None
-            recognised = self._map.recognise(seen, frame.camera)
+            recognised, near = self._map.recognise(seen, frame.camera), self._among_views(seen, frame.camera)
+            if near is not None and (recognised is None or near.inliers >= recognised.inliers):
+                return near.T @ back, None
             depth = 0.0 if recognised is None else self._map.places[recognised.index].depth
         else:
-            keyframe = self._tracker.newest_keyframe()
+            keyframe = self._tracker.known_keyframe()
             if keyframe is None or keyframe.stamp_ns == self._sighted:
                 return None
             self._sighted, back = keyframe.stamp_ns, se3.inverse(keyframe.T_map_camera)
@@ -205,12 +205,11 @@ class TrackingSession:
             return start, recognised
         return None
 
-    def _among_views(self, seen: Features, camera: Camera) -> Float64 | None:
-        """T_map_camera of an image that shows what was seen in the last seconds."""
+    def _among_views(self, seen: Features, camera: Camera) -> Sighting | None:
+        """An image that shows what was seen in the last seconds."""
         if not self._views:
             return None
-        sighting = sight([p for p, _ in self._views], np.array([T for _, T in self._views]), seen, camera)
-        return None if sighting is None else sighting.T
+        return sight([p for p, _ in self._views], np.array([T for _, T in self._views]), seen, camera)
 
     def _unknown(self, update: TrackingUpdate, ended: tuple[Keyframe, ...]) -> TrackingUpdate:
         """Nothing can be said in the map's frame."""

@@ -127,9 +127,13 @@ class Tracker:
         """T_map_camera of the final keyframes."""
         return Trajectory.from_pairs(list(self._final.items()), self.scale)
 
-    def newest_keyframe(self) -> Keyframe | None:
-        """The newest keyframe as it is now, still under optimisation; None before the map exists."""
-        return self._window.keyframes[-1].final(self.scale) if len(self._window) else None
+    def known_keyframe(self) -> Keyframe | None:
+        """The newest keyframe half of whose patches are landmarks, as it is now; None before there is one."""
+        for tracked in reversed(self._window.keyframes):
+            keyframe = tracked.final(self.scale)
+            if keyframe.landmarks is not None and 2 * len(keyframe.landmarks) >= len(tracked.patches):
+                return keyframe
+        return None
 
     # ---- the steps
 

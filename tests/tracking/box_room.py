@@ -3,6 +3,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 
@@ -82,3 +84,24 @@ def path(count: int, step: float = 0.03) -> Float64:
     t = np.arange(count) * step
     xi = np.stack([np.sin(t), 0.3 * np.sin(2 * t), 0.8 * (1 - np.cos(t)), 0.1 * t, 0.5 * np.sin(t), 0.05 * t], axis=-1)
     return np.array([se3.exp(x) for x in xi])
+
+
+def circle(count: int, lap: int, radius: float) -> Float64:
+    """A camera that walks a circle and looks outwards, once round in ``lap`` poses, [count, 4, 4]."""
+    poses = []
+    for a in 2 * np.pi * np.arange(count) / lap:
+        T = se3.exp(np.array([0, 0, 0, 0, a, 0]))
+        T[:3, 3] = radius * np.array([np.sin(a), 0, np.cos(a) - 1])
+        poses.append(T)
+    return np.array(poses)
+
+
+def warming_up(frames: list[Frame], first: int, last: int, share: float = 0.1) -> list[Frame]:
+    """The same frames with dense depth that is too far from one to another, by ``share`` half way between them."""
+    out = list(frames)
+    for k in range(first, last):
+        depth = frames[k].depth
+        assert depth is not None
+        factor = 1 + share * np.sin(np.pi * (k - first) / (last - first))
+        out[k] = replace(frames[k], depth=DepthMap(depth.z * np.float32(factor)))
+    return out

@@ -13,19 +13,14 @@ from sf_interfaces.types import DepthMap, Keyframe, PointCloud, Scale
 from sf_tracking.core import sim3
 from sf_tracking.core.keyframe_map import KeyframeMap
 from sf_tracking.core.places import Index, features
-from tests.tracking.box_room import CAMERA, STEP_NS, BoxRoom
+from tests.tracking.box_room import CAMERA, STEP_NS, BoxRoom, circle
 
 LAP, AGAIN = 36, 8
 
 
 def turn(count: int) -> np.ndarray:
-    """A camera that walks a small circle and looks outwards: once round in ``LAP`` keyframes, [count, 4, 4]."""
-    poses = []
-    for a in 2 * np.pi * np.arange(count) / LAP:
-        T = se3.exp(np.array([0, 0, 0, 0, a, 0]))
-        T[:3, 3] = 0.8 * np.array([np.sin(a), 0, np.cos(a) - 1])
-        poses.append(T)
-    return np.array(poses)
+    """A walk once round in ``LAP`` keyframes."""
+    return circle(count, LAP, 0.8)
 
 
 @lru_cache
