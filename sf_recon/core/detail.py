@@ -42,33 +42,42 @@ def view_distances(T_map_camera: Float64, poses: Float64, depth: float) -> Float
     return np.arccos(np.clip(cosine, -1, 1)) + shift / depth
 
 
+def nearest_views(
+    views: Sequence[KeyframeView], T_map_camera: Float64, depth: float, count: int
+) -> list[tuple[KeyframeView, float]]:
+    """The ``count`` keyframes that look most alike at a scene ``depth`` m away, with their view distances."""
+    if not views or count == 0:
+        return []
+    distances = view_distances(T_map_camera, np.stack([v.T_map_camera for v in views]), depth)
+    return [(views[i], float(distances[i])) for i in np.argsort(distances, kind="stable")[:count]]
+
+
 def detail(
-    views: Sequence[KeyframeView],
+    nearest: Sequence[tuple[KeyframeView, float]],
     camera: Camera,
     T_map_camera: Float64,
     z: Float32,
     surface: NDArray[np.bool_],
     *,
-    count: int,
     reach: float,
 ) -> Detail:
-    """Blend the images of the ``count`` nearest keyframes, weighted by inverse squared view distance.
+    """Blend the images of the nearest keyframes, weighted by inverse squared view distance.
 
     Args:
+        nearest: keyframes and their view distances, nearest first.
         z: [H, W] m, finite everywhere.
         surface: [H, W]; where False, z is a guess and a keyframe is not asked whether it saw that depth.
         reach: view distance up to which a keyframe is trusted; fully up to half of it.
     """
     color, total = np.zeros((*z.shape, 3), np.float32), np.zeros(z.shape, np.float32)
     confidence = np.zeros(z.shape, np.float32)
-    distances = view_distances(T_map_camera, np.stack([v.T_map_camera for v in views]), float(np.median(z)))
-    for rank, index in enumerate(np.argsort(distances, kind="stable")[:count]):
-        trust = float(np.clip(1.5 - distances[index] / reach, 0, 1))
+    for rank, (view, distance) in enumerate(nearest):
+        trust = float(np.clip(1.5 - distance / reach, 0, 1))
         if trust == 0 or (rank > 1 and (confidence >= trust).sum() > _ENOUGH * surface.sum()):
             break
-        image, covered, agreement = _reproject(views[index], camera, T_map_camera, z, surface)
+        image, covered, agreement = _reproject(view, camera, T_map_camera, z, surface)
         np.maximum(confidence, trust * covered, out=confidence)
-        weight = covered * agreement * np.float32(1 / (distances[index] ** 2 + 1e-5))
+        weight = covered * agreement * np.float32(1 / (distance**2 + 1e-5))
         color += cv2.multiply(image, cv2.merge([weight] * 3), dtype=cv2.CV_32F)
         total += weight
     return Detail(color / np.maximum(total, 1e-12)[..., None], confidence, total > 0)

@@ -112,14 +112,15 @@ void tables() {
     expect(sf::interpolate(table.data(), 100, 3, ids.data(), weights.data(), 3, 2, out.data(), 2), "interpolate");
     const float ones[2] = {1.0f, 1.0f};
     expect(!sf::interpolate(table.data(), 100, 3, &ids[4], ones, 1, 2, out.data(), 1), "an id below the table");
-    std::vector<float> sums(300), values = table, mean(300), square(300), steps(100);
-    std::vector<uint8_t> marks(100);
-    std::vector<int64_t> touched;
-    expect(!sf::accumulate_rows(&ids[4], ones, 1, 2, out.data(), 3, sums.data(), marks.data(), 100, touched), "an id");
-    expect(sf::accumulate_rows(ids.data(), ones, 1, 2, out.data(), 3, sums.data(), marks.data(), 100, touched), "sums");
-    steps[99] = 1e6f;
-    sf::adam_rows(touched, 3, {0.01f, 0.9f, 0.99f, 1e-15f}, sums.data(), values.data(), mean.data(), square.data(),
-                  steps.data(), 2);
+    std::vector<float> values = table;
+    std::vector<uint16_t> mean(300), root(300);
+    std::vector<int16_t> steps(100);
+    const sf::AdamTable all{values.data(), mean.data(), root.data(), steps.data(), 100, 3};
+    const sf::AdamRates rates{0.01f, 0.9f, 0.99f, 1e-3f};
+    expect(!sf::adam_rows(&ids[4], ones, 1, 2, out.data(), all, rates, 1) && values == table, "an id below the table");
+    steps[99] = 32767;
+    expect(sf::adam_rows(ids.data(), ones, 1, 2, out.data(), all, rates, 2), "a step");
+    expect(steps[0] == 1 && steps[5] == 0 && values[0] != table[0] && values[15] == table[15], "rows that rest");
     expect(sf::voxel_means(table.data(), 100, 3, 0.5f).size() % 3 == 0, "means");
     try {
         sf::voxel_means(&kNan, 0, 3, 0.5f);
