@@ -1,9 +1,9 @@
 """Accuracy and completion of the surface that was seen, from samples to triangles.
 
 A distance between two sets of samples has a floor: with n samples on an area A the nearest one is 0.5 * sqrt(A / n)
-away although both surfaces are the same; 200 000 samples on the 200 m^2 of a room give 1.6 cm. And frusta see through walls: the
-backs and insides of furniture count as missing though no camera can show them. Here the distance is that to the
-nearest triangle, and a sample of the reference counts if a view sees it (GO-Surf and Co-SLAM cull so).
+away although both surfaces are the same; 200 000 samples on the 200 m^2 of a room give 1.6 cm. And frusta see
+through walls: the backs and insides of furniture count as missing though no camera can show them. Here the distance
+is that to the nearest triangle, and a sample of the reference counts if a view sees it (GO-Surf and Co-SLAM cull so).
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -22,7 +22,6 @@ from sf_bringup.evaluation.mesh import (
     seen_by_any,
 )
 from sf_interfaces.errors import FormatError
-from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64
 
 MOST_VIEWS = 200  # evenly spread ones are enough to see what a path sees
