@@ -118,7 +118,7 @@ class Renderer:
         image, trust = np.zeros((*z.shape, 3), np.float32), np.zeros(z.shape, np.float32)
         if c.detail and len(views) and surface.any():
             nearest = nearest_views(views, T_map_camera, _middle(z), c.detail)
-            found = detail(nearest, camera, T_map_camera, fill(z), surface, reach=c.detail_reach)
+            found = detail(nearest, camera, T_map_camera, fill(z), surface, reach=c.detail_reach, threads=c.threads)
             image, trust = found.color, found.confidence
             if not c.fill_holes:
                 image[~surface] = 0

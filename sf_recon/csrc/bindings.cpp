@@ -2,9 +2,11 @@
 // Python module sf_recon._native: arrays in, arrays out. Bad shapes are a TypeError, bad coordinates an IndexError.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <memory>
 #include <mutex>
@@ -16,6 +18,7 @@
 #include "ipr_cpu.hpp"
 #include "point_grid.hpp"
 #include "rows.hpp"
+#include "view_blend.hpp"
 
 namespace nb = nanobind;
 
@@ -35,6 +38,13 @@ using Matrix4 = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::devi
 using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 using Halves = nb::ndarray<uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Steps = nb::ndarray<int16_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Matrix3 = nb::ndarray<const float, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
+using Grid2 = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Mask = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<const uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Bytes = nb::ndarray<const uint8_t, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using MutableGrid = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using MutableImage = nb::ndarray<float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Out = nb::ndarray<nb::numpy, T>;
 
@@ -118,6 +128,24 @@ void adam_rows(Ids ids, Rows weights, Rows gradient, MutableRows table, Halves m
     const sf::AdamTable all{table.data(), mean.data(), root.data(), steps.data(), rows, columns};
     if (!sf::adam_rows(ids.data(), weights.data(), n, k, gradient.data(), all, {rate, beta1, beta2, epsilon}, threads))
         throw nb::index_error("adam_rows: id out of range");
+}
+
+void blend_view(Grid2 z, Mask surface, Bytes image, Counts depth, float step, Matrix3 A, Vector b, float trust,
+                float weight, const std::array<float, 4>& rules, MutableImage color, MutableGrid total,
+                MutableGrid confidence, int threads) {
+    const size_t height = z.shape(0), width = z.shape(1);
+    const auto fits = [&](const auto& other) { return other.shape(0) == height && other.shape(1) == width; };
+    if (!fits(surface) || !fits(color) || !fits(total) || !fits(confidence))
+        throw nb::value_error("blend_view: images of the drawn view differ in size");
+    if (image.shape(0) != depth.shape(0) || image.shape(1) != depth.shape(1) || image.size() == 0)
+        throw nb::value_error("blend_view: image and depth of the keyframe differ in size or are empty");
+    sf::SourceView view{image.data(), depth.data(), step, static_cast<int>(image.shape(1)),
+                        static_cast<int>(image.shape(0)), {}, {}, trust, weight};
+    std::copy(A.data(), A.data() + 9, view.A);
+    std::copy(b.data(), b.data() + 3, view.b);
+    const nb::gil_scoped_release release;
+    sf::blend_view(z.data(), surface.data(), static_cast<int>(width), static_cast<int>(height), view,
+                   {rules[0], rules[1], rules[2], rules[3]}, color.data(), total.data(), confidence.data(), threads);
 }
 
 // A network of Python arrays, checked and kept alive.
@@ -267,6 +295,10 @@ NB_MODULE(_native, m) {
     m.def("adam_rows", &adam_rows, nb::arg("ids"), nb::arg("weights"), nb::arg("gradient"),
           nb::arg("table").noconvert(), nb::arg("mean").noconvert(), nb::arg("root").noconvert(),
           nb::arg("steps").noconvert(), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"),
+          nb::arg("threads") = 0);
+    m.def("blend_view", &blend_view, nb::arg("z"), nb::arg("surface"), nb::arg("image"), nb::arg("depth"),
+          nb::arg("step"), nb::arg("A"), nb::arg("b"), nb::arg("trust"), nb::arg("weight"), nb::arg("rules"),
+          nb::arg("color").noconvert(), nb::arg("total").noconvert(), nb::arg("confidence").noconvert(),
           nb::arg("threads") = 0);
     m.def("decode_colors", &decode_colors, nb::arg("queries"), nb::arg("levels"), nb::arg("layers"),
           nb::arg("neighbours"), nb::arg("eye") = nb::none(), nb::arg("degree") = 0, nb::arg("base") = nb::none(),

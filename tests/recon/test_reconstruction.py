@@ -15,7 +15,7 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Keyframe, Scale, Trajectory
 from sf_recon.config import ReconConfig
 from sf_recon.core.color_field import Neighbourhood, gaussian_weights
-from sf_recon.core.detail import detail, nearest_views
+from sf_recon.core.detail import Sums, blend_reference, detail, nearest_views, weight_of
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.reconstruction import Reconstruction
 from sf_recon.core.silhouette import sharpen
@@ -286,6 +286,26 @@ def test_row_adam_equals_adam_and_keeps_moments_when_it_grows() -> None:
             table = torch.cat([table, torch.zeros(3, 3)])
     torch.testing.assert_close(table[:4], parameter.detach(), rtol=2e-3, atol=3e-4)  # moments are half precision
     assert not table[4:].any() and rows.steps.tolist() == [6] * 4 + [0] * 3
+
+
+def test_the_compiled_blend_equals_its_definition(room: Reconstruction) -> None:
+    rng = np.random.default_rng(0)
+    key = view(0)
+    z = np.array(key.depth.z) * rng.uniform(0.9, 1.2, key.depth.z.shape).astype(np.float32)
+    surface = rng.random(z.shape) < 0.8
+    z[5, 5] = 1e-9  # behind or at the camera of some keyframe
+    chosen = nearest_views(room.views, key.T_map_camera, 2.0, 4)
+    sums = Sums.zeros(z.shape)
+    for kept, distance in chosen:
+        trust = float(np.clip(1.5 - distance, 0, 1))
+        blend_reference(kept, CAMERA, key.T_map_camera, z, surface, trust, weight_of(distance), sums)
+    one, two = (detail(chosen, CAMERA, key.T_map_camera, z, surface, reach=1.0, threads=n) for n in (1, 2))
+    assert np.array_equal(one.color, two.color) and np.array_equal(one.confidence, two.confidence)
+    expected = sums.color / np.maximum(sums.total, 1e-12)[..., None]
+    same = np.isclose(one.confidence, sums.confidence, atol=1e-4)
+    assert same.mean() > 0.999 and (one.known == (sums.total > 0)).mean() > 0.999
+    difference = np.abs(one.color - expected)[same].max(axis=1)
+    assert np.quantile(difference, 0.995) < 1.0 and difference.mean() < 0.1  # grey levels; OpenCV's grid of 1/32 px
 
 
 def test_keyframes_cut_a_near_surface_back_to_its_border() -> None:

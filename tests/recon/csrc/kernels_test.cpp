@@ -13,6 +13,7 @@
 #include "ipr_cpu.hpp"
 #include "point_grid.hpp"
 #include "rows.hpp"
+#include "view_blend.hpp"
 
 namespace {
 
@@ -153,6 +154,23 @@ void decoder() {
     expect(sf::decode_image(network, queries.data(), 0, 0, T, colors.data(), 2), "an empty image");
 }
 
+void blend() {
+    const int width = 37, height = 11;
+    std::vector<float> z(width * height, 1.0f), color(3 * width * height), total(width * height), trust(width * height);
+    const float hostile[] = {0.0f, kTiny, -1.0f, kMax, kInf, kNan, 1e-7f};
+    for (size_t i = 0; i < 7; ++i) z[30 * i] = hostile[i];
+    const std::vector<uint8_t> surface(width * height, 1), image(3 * 5 * 3, 200);
+    const std::vector<uint16_t> depth(5 * 3, 1000);
+    for (const float focal : {0.0f, 1.0f, 1e30f, kNan}) {
+        const sf::SourceView view{image.data(), depth.data(), 1e-3f, 5, 3, {focal, 0, 0, 0, focal, 0, 0, 0, 1},
+                                  {1, 1, 0}, 1.0f, 2.0f};
+        sf::blend_view(z.data(), surface.data(), width, height, view, {0.05f, 0.3f, 16.0f, 0.1f}, color.data(),
+                       total.data(), trust.data(), 2);
+    }
+    for (size_t i = 0; i < total.size(); ++i)
+        expect(total[i] >= 0.0f && trust[i] <= 1.0f && std::abs(color[3 * i] - 200.0f * total[i]) < 0.1f, "a blend");
+}
+
 }  // namespace
 
 int main() {
@@ -160,5 +178,6 @@ int main() {
     grid();
     tables();
     decoder();
+    blend();
     std::puts("all kernels behave");
 }
