@@ -21,6 +21,10 @@ _ROOMS = ["room0", "room1", "room2", "office0", "office1", "office2", "office3",
 FOLDER = {
     "speed": ([], ["--frames", "300", "--stride", "1", "--factor", "1"]),
     "rooms": ([], ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1"]),
+    "rooms_given": (
+        ["--frames", "60"],
+        ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1", "--every", "10"],
+    ),
     "depth": (["--line", "room0"], ["--all", "--oracle", "--line", *_ROOMS, "hall"]),
     "scales": ([], ["--frames", "400", "--factor", "1"]),
     "real": ([], ["--frames", "1000"]),

@@ -161,9 +161,14 @@ def _demo(args: argparse.Namespace) -> int:
 
 
 def _render(args: argparse.Namespace) -> int:
-    from sf_bringup.looking import render_views
+    if args.fly is not None:
+        from sf_bringup.flythrough import fly
 
-    count = render_views(args.run, args.poses, args.out)
+        count = fly(args.run, args.fly, args.out)
+    else:
+        from sf_bringup.looking import render_views
+
+        count = render_views(args.run, args.poses, args.out)
     _print({"views": count}, args.json, f"wrote {count} views to {args.out}")
     return 0
 
@@ -297,8 +302,10 @@ def build_parser() -> argparse.ArgumentParser:
 
     p = verb("render", _render, "render views of a finished run")
     p.add_argument("run", type=Path)
-    p.add_argument("--poses", type=Path, required=True, help="T_map_camera in TUM format")
-    p.add_argument("--out", type=Path, required=True)
+    way = p.add_mutually_exclusive_group(required=True)
+    way.add_argument("--poses", type=Path, help="T_map_camera in TUM format")
+    way.add_argument("--fly", type=int, metavar="N", help="N frames along the smoothed way of the keyframes")
+    p.add_argument("--out", type=Path, required=True, help="folder of images; with --fly also a .mp4 file")
     _add_view(verb("view", _view, "serve a page that shows the map of a finished run"))
 
     p = verb("export", _export, "write the results of a run in other formats; without a format: all it has")

@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             p.add_argument("--holdout", type=float, default=0.5, help="fraction of LiDAR points to predict")
         elif name == "mesh":
             p.add_argument("--icp", action="store_true", help="align by ICP before measuring (within 0.1 m)")
-            p.add_argument("--poses", type=Path, help="views for NICE culling of a mesh file, TUM format")
+            p.add_argument("--poses", type=Path, help="views that cull a mesh file, TUM format")
             p.add_argument("--calibration", type=Path, help="camera of those views, camera.yaml")
 
 
@@ -116,13 +116,13 @@ def _completion(args: argparse.Namespace) -> dict[str, Any]:
 
 def _mesh(args: argparse.Namespace) -> dict[str, Any]:
     from sf_bringup.eval_files import read_surface, read_trajectory
-    from sf_bringup.evaluation.mesh import icp, surface_error
-    from sf_bringup.measures import measure_mesh
+    from sf_bringup.evaluation.mesh import icp
+    from sf_bringup.measures import measure_mesh, surface_errors
     from sf_bringup.run_folder import RunFolder
     from sf_interfaces.io.calibration import read_camera
 
     if (args.poses is None) != (args.calibration is None):
-        raise ConfigError("NICE culling needs both --poses and --calibration: the views and their camera")
+        raise ConfigError("culling needs both --poses and --calibration: the views and their camera")
     if _is_run(args.run):
         if args.reference is None:
             raise ConfigError("pass --reference MESH: a run carries no true surface ('sf simulate --mesh' writes one)")
@@ -131,11 +131,10 @@ def _mesh(args: argparse.Namespace) -> dict[str, Any]:
     found, truth = read_surface(args.run), read_surface(_reference(args))
     if args.icp:
         found = found.moved(icp(found, truth))
-    out = {"nicer_unculled": surface_error(found, truth).as_dict()}
+    views = None
     if args.poses is not None:
         views = (read_camera(args.calibration)[0], read_trajectory(args.poses).poses)
-        out = {"nice_culled": surface_error(found, truth, views).as_dict(), **out}
-    return out
+    return {name: error.as_dict() for name, error in surface_errors(found, truth, views).items()}
 
 
 def _render(args: argparse.Namespace) -> dict[str, Any]:

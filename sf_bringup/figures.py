@@ -92,6 +92,17 @@ def _depth_or_note(axis: Any, z: Any, title: str, figure: Figure, cmap: str = "t
         _depth_panel(axis, np.asarray(z, np.float64), title, figure, cmap=cmap)
 
 
+def views_figure(pairs: Sequence[tuple[UInt8, UInt8]]) -> Figure:
+    """The recorded image, the rendered view and four times their difference, one row for each (rendered, real)."""
+    figure, axes = plt.subplots(len(pairs), 3, figsize=(13, 3.2 * len(pairs)), squeeze=False, constrained_layout=True)
+    for row, (rendered, real) in zip(axes, pairs, strict=True):
+        difference = np.clip(4 * np.abs(rendered.astype(int) - real), 0, 255).astype(np.uint8)
+        titles = ("recorded, not a keyframe", "rendered", "4 x difference")
+        for axis, image, title in zip(row, (real, rendered, difference), titles, strict=True):
+            _image_panel(axis, image, title)
+    return figure
+
+
 def trajectory_figure(pair: AlignedTrajectories) -> Figure:
     """Top view beside the reference, and the position error over time."""
     figure, (top, error) = plt.subplots(1, 2, figsize=(13, 5), constrained_layout=True)

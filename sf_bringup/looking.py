@@ -17,7 +17,12 @@ from sf_interfaces.errors import FormatError
 from sf_interfaces.io.trajectory import read_tum
 
 
-def _map(run: RunFolder) -> Any:
+def open_map(run: RunFolder) -> Any:
+    """The reconstruction of a run.
+
+    Raises:
+        FormatError: the run has none.
+    """
     if not run.map.is_file():
         raise FormatError(f"{run.map} is missing: the line of this run made no map; run with --goal recon")
     return load_map(run.map)
@@ -36,7 +41,7 @@ def render_views(run_path: Path, poses: Path, out: Path) -> int:
         FormatError: no such run, no map in it, or no poses.
     """
     run = RunFolder.open(run_path)
-    field, camera, views = _map(run), run.camera(), read_tum(poses)
+    field, camera, views = open_map(run), run.camera(), read_tum(poses)
     out.mkdir(parents=True, exist_ok=True)
     for stamp, T in zip(views.stamps_ns.tolist(), views.poses, strict=True):
         view = field.render(camera, T, full=True)
@@ -63,7 +68,7 @@ def view(run_path: Path, host: str, port: int, ready: Callable[[str], None]) -> 
         ConfigError: the viewer is not installed.
         FormatError: no such run, or no map in it.
     """
-    page = _map(RunFolder.open(run_path)).serve(host, port)
+    page = open_map(RunFolder.open(run_path)).serve(host, port)
     ready(page.url)
     try:
         threading.Event().wait()

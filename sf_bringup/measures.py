@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from sf_bringup.discovery import DENSE_FRACTION
 from sf_bringup.eval_files import DEPTH_SUFFIXES, files_by_name, read_depth, read_surface, read_trajectory
 from sf_bringup.evaluation import (
     DepthError,
+    Samples,
     SurfaceError,
     TrajectoryError,
     align_trajectories,
@@ -27,13 +28,14 @@ from sf_bringup.evaluation import (
 from sf_bringup.evaluation.image import Lpips
 from sf_bringup.evaluation.mesh import icp
 from sf_bringup.evaluation.robust_mvd import mvd_error
+from sf_bringup.evaluation.seen_surface import seen_surface_error
 from sf_bringup.run_folder import RunFolder
 from sf_interfaces import topics
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.ros.messages import decode_depth, decode_image, decode_pose, to_ns
-from sf_interfaces.types import DepthMap, Float64, Scale, Trajectory, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float64, Scale, Trajectory, UInt8
 
 GROUND_TRUTH_POSE = topics.GROUND_TRUTH_PREFIX + "pose"
 GROUND_TRUTH_DEPTH = topics.GROUND_TRUTH_PREFIX + "depth/image"
@@ -212,7 +214,8 @@ def measure_mesh(run: RunFolder, reference: Path, with_icp: bool = False) -> dic
     run's is arbitrary), then by ICP if wanted.
 
     Returns:
-        ``nice_culled``: within the frusta of the true trajectory; ``nicer_unculled``: all of both surfaces.
+        ``seen``: what the views of the true trajectory see, from samples to triangles; ``nice_culled``: within
+        their frusta, between samples; ``nicer_unculled``: all of both surfaces, between samples.
     """
     file = next((p for p in (run.path / "mesh.ply", run.path / "surface.ply") if p.is_file()), None)
     if file is None:
@@ -222,8 +225,17 @@ def measure_mesh(run: RunFolder, reference: Path, with_icp: bool = False) -> dic
     surface = read_surface(file).moved(T_truth_map, scale)
     if with_icp:
         surface = surface.moved(icp(surface, given))
-    views = (run.camera(), truth.poses)
-    return {"nice_culled": surface_error(surface, given, views), "nicer_unculled": surface_error(surface, given)}
+    return surface_errors(surface, given, (run.camera(), truth.poses))
+
+
+def surface_errors(surface: Samples, given: Samples, views: tuple[Camera, Float64] | None) -> dict[str, SurfaceError]:
+    """All surface measures of two surfaces in one frame; without ``views`` (camera, T_map_camera) nothing is culled."""
+    errors = {"nicer_unculled": surface_error(surface, given)}
+    if views is not None:
+        errors = {"nice_culled": surface_error(surface, given, views), **errors}
+        if len(given.triangles):
+            errors = {"seen": seen_surface_error(surface, given, *views), **errors}
+    return errors
 
 
 def held_out_stamps(run: RunFolder) -> list[int]:
@@ -261,33 +273,37 @@ def render_held_out(run: RunFolder) -> list[HeldOutView]:
     if not stamps or topic is None:
         return []
     poses = frame_poses(run)
-    return _render(run, topic, dict(zip(poses.stamps_ns.tolist(), poses.poses, strict=True)), set(stamps))
+    pose_of = dict(zip(poses.stamps_ns.tolist(), poses.poses, strict=True))
+    return render_at(run, input_bag(run), topic, {stamp: pose_of[stamp] for stamp in stamps})
 
 
-def render_novel(run: RunFolder) -> list[HeldOutView]:
+def render_novel(run: RunFolder, bag: Path | None = None) -> list[HeldOutView]:
     """Extrapolated views: true views off the path, brought into the run's map by the trajectories' alignment.
 
+    Args:
+        bag: what holds them; None: the input of the run.
+
     Raises:
-        FormatError: the input has no such views.
+        FormatError: the bag has no such views.
     """
-    bag = input_bag(run)
+    bag = input_bag(run) if bag is None else bag
     novel, truth = _poses(bag, NOVEL_POSE), reference_trajectory(bag)
     if novel is None or truth is None:
         raise FormatError(f"the input has no {NOVEL_IMAGE}; only a simulation with --novel-views has it")
     scale, T_truth_map = _into_truth(run, truth)
     poses = se3.inverse(T_truth_map) @ novel.poses
     poses[:, :3, 3] /= scale
-    stamps = novel.stamps_ns.tolist()
-    return _render(run, NOVEL_IMAGE, dict(zip(stamps, poses, strict=True)), set(stamps))
+    return render_at(run, bag, NOVEL_IMAGE, dict(zip(novel.stamps_ns.tolist(), poses, strict=True)))
 
 
-def _render(run: RunFolder, topic: str, pose_of: dict[int, Float64], stamps: set[int]) -> list[HeldOutView]:
+def render_at(run: RunFolder, bag: Path, topic: str, pose_of: Mapping[int, Float64]) -> list[HeldOutView]:
+    """Views drawn at T_map_camera by stamp, beside the images of ``topic`` of a bag with these stamps."""
     from sf_bringup.pipeline import load_map
 
     if not run.map.is_file():
         return []
     field, camera, out = load_map(run.map), run.camera(), []
-    for stamp, image in decoded(input_bag(run), topic, decode_image, stamps):
+    for stamp, image in decoded(bag, topic, decode_image, set(pose_of)):
         view = field.render(camera, pose_of[stamp])
         real = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
         out.append(HeldOutView(stamp, view.image, real, view.depth.valid))

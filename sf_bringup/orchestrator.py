@@ -32,6 +32,7 @@ HOSTS = "hosts"  # section of the configuration: node -> host that runs it with 
 _LOOK_S = 0.25  # between two looks at the graph
 _SETTLE_S = 1.0  # topics must have stayed the same this long before the line is planned anew
 _SAVE_S = 1.5  # at the end, for results to be written: with SIGTERM after it, all are gone within three seconds
+_VIEW_PORT = 8080
 _GONE_S = 30.0  # an input of the running line may be silent this long (a driver restarts) before the line changes
 
 
@@ -234,6 +235,14 @@ def parse(args: Sequence[str] | None) -> argparse.Namespace:
         default=_SAVE_S,
         help="seconds the nodes may take after Ctrl-C to write their results (large maps take more than the default)",
     )
+    parser.add_argument(
+        "--view",
+        nargs="?",
+        type=int,
+        const=_VIEW_PORT,
+        metavar="PORT",
+        help=f"serve a page on this machine that shows the map while it grows (default port: {_VIEW_PORT})",
+    )
     parser.add_argument("--replay", action="store_true", help="drop nothing: a lossless player feeds the line")
     return parser.parse_args(args)
 
@@ -262,7 +271,8 @@ def main(args: Sequence[str] | None = None) -> int:
         signal.signal(number, stop)
     try:
         given = parse(args)
-        config = ConfigFile.load(given.config, _pairs(given.set, "--set"))
+        shown = {} if given.view is None else {"recon.view_port": str(given.view)}
+        config = ConfigFile.load(given.config, shown | _pairs(given.set, "--set"))
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = Orchestrator(
             given.goal, _pairs(given.map, "--map"), config, given.out,

@@ -141,7 +141,7 @@ def summarise(run: RunFolder) -> Summary:
     return Summary(run, values)
 
 
-def _last_keyframe_sample(run: RunFolder) -> figures.Sample | None:
+def _middle_keyframe_sample(run: RunFolder, views: list[measures.HeldOutView]) -> figures.Sample | None:
     """Image, LiDAR points, completed depth and rendered view of the keyframe in the middle of the run."""
     maps = dict(run.depth_maps())
     if not maps:
@@ -159,7 +159,6 @@ def _last_keyframe_sample(run: RunFolder) -> figures.Sample | None:
     sparse: DepthMap | None = None
     if topics.KEYFRAME_DEPTH.name in found:
         sparse = decode_depth(found[topics.KEYFRAME_DEPTH.name])
-    views = measures.render_held_out(run)
     middle = views[len(views) // 2].rendered if views else None
     is_sparse = sparse is not None and sparse.density < 0.5
     image = decode_image(found[topics.KEYFRAME_IMAGE.name])
@@ -169,11 +168,16 @@ def _last_keyframe_sample(run: RunFolder) -> figures.Sample | None:
 def run_figures(run: RunFolder) -> dict[str, Figure]:
     """Every plot that this run has the data for, by name."""
     out = {}
-    sample, pair = _or_reason(lambda: _last_keyframe_sample(run)), _or_reason(lambda: _aligned(run))
+    drawn = _or_reason(lambda: measures.render_held_out(run))
+    views = [] if isinstance(drawn, str) else drawn
+    sample, pair = _or_reason(lambda: _middle_keyframe_sample(run, views)), _or_reason(lambda: _aligned(run))
     if isinstance(sample, figures.Sample):
         out["overview"] = figures.overview(sample, *_ways(run, pair))
     if isinstance(pair, AlignedTrajectories):
         out["trajectory"] = figures.trajectory_figure(pair)
+    if views:
+        chosen = sorted({0, len(views) // 2, len(views) - 1})
+        out["views that were not used"] = figures.views_figure([(views[k].rendered, views[k].real) for k in chosen])
     depth = _or_reason(lambda: [(found, truth) for _, found, truth in measures.depth_pairs(run)])
     if depth and not isinstance(depth, str):
         shown = sorted({0, len(depth) // 2, len(depth) - 1})

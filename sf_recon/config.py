@@ -29,6 +29,7 @@ class ReconConfig:
     detail_reach: float = option(
         0.5, "view distance (rotation in rad plus translation over depth) up to which they do", low=0.01
     )
+    sharpen: int = option(3, "nearest keyframes that cut near surfaces back to their borders; 0: none", low=0)
     fill_holes: bool = option(True, "colour pixels without a surface from the nearest keyframe image (depth stays NaN)")
     iterations: int = option(40, "training iterations for each keyframe", low=0)
     final_iterations: int = option(200, "training iterations after the last keyframe", low=0)

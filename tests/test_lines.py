@@ -8,6 +8,7 @@ import shutil
 import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from mcap_ros2.reader import read_ros2_messages
@@ -134,6 +135,12 @@ def test_finished_runs_are_exported_rendered_and_measured(
     assert len(np.loadtxt(tmp_path / "x" / "trajectory.kitti")) == SMALL["frames"]
     assert cli.main(["render", str(out), "--poses", str(out / "keyframes.tum"), "--out", str(tmp_path / "v")]) == 0
     assert list((tmp_path / "v").glob("*.depth.png"))
+    assert "views that were not used" in (out / "report.html").read_text()
+    assert cli.main(["render", str(out), "--fly", "7", "--out", str(tmp_path / "flight.mp4")]) == 0
+    video = cv2.VideoCapture(str(tmp_path / "flight.mp4"))
+    frames = [video.read()[1] for _ in range(7)]
+    assert not video.read()[0] and all(f.shape == frames[0].shape for f in frames)
+    assert np.abs(frames[0].astype(int) - frames[6]).mean() > 2 and frames[3].std() > 10
     capsys.readouterr()
     assert cli.main(["eval", "traj", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rmse"] < 0.02

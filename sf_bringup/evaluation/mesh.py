@@ -94,7 +94,11 @@ def surface_error(
         rec, ref = (points[seen_by_any(points, *views)] for points in (rec, ref))
         if len(rec) == 0 or len(ref) == 0:
             raise FormatError("no part of the surface lies in any view; are surface and trajectory in one frame?")
-    accuracy, completion = nearest_distance(rec, ref), nearest_distance(ref, rec)
+    return error_of_distances(nearest_distance(rec, ref), nearest_distance(ref, rec))
+
+
+def error_of_distances(accuracy: Float64, completion: Float64) -> SurfaceError:
+    """The measures of distances [N] m from the reconstruction to the reference and [M] m back."""
     precision, recall = (100 * float((d < THRESHOLD).mean()) for d in (accuracy, completion))
     return SurfaceError(
         accuracy=100 * float(accuracy.mean()),
@@ -102,7 +106,7 @@ def surface_error(
         completion_ratio=recall,
         precision=precision,
         f_score=2 * precision * recall / (precision + recall) if precision + recall else 0.0,
-        samples=len(ref),
+        samples=len(completion),
     )
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float32, Float64
 from sf_recon.core.keyframe_view import KeyframeView
+from sf_recon.core.native import native
 
 _DOUBT = 0.05  # of the depth: a keyframe whose own depth is off by so much counts half
 _OTHER = 0.3  # of the depth: off by more, it saw another surface. Poses and the drawn edges err by some percent.
@@ -42,36 +43,91 @@ def view_distances(T_map_camera: Float64, poses: Float64, depth: float) -> Float
     return np.arccos(np.clip(cosine, -1, 1)) + shift / depth
 
 
+def nearest_views(
+    views: Sequence[KeyframeView], T_map_camera: Float64, depth: float, count: int
+) -> list[tuple[KeyframeView, float]]:
+    """The ``count`` keyframes that look most alike at a scene ``depth`` m away, with their view distances."""
+    if not views or count == 0:
+        return []
+    distances = view_distances(T_map_camera, np.stack([v.T_map_camera for v in views]), depth)
+    return [(views[i], float(distances[i])) for i in np.argsort(distances, kind="stable")[:count]]
+
+
 def detail(
-    views: Sequence[KeyframeView],
+    nearest: Sequence[tuple[KeyframeView, float]],
     camera: Camera,
     T_map_camera: Float64,
     z: Float32,
     surface: NDArray[np.bool_],
     *,
-    count: int,
     reach: float,
+    threads: int = 0,
 ) -> Detail:
-    """Blend the images of the ``count`` nearest keyframes, weighted by inverse squared view distance.
+    """Blend the images of the nearest keyframes, weighted by inverse squared view distance.
 
     Args:
+        nearest: keyframes and their view distances, nearest first.
         z: [H, W] m, finite everywhere.
         surface: [H, W]; where False, z is a guess and a keyframe is not asked whether it saw that depth.
         reach: view distance up to which a keyframe is trusted; fully up to half of it.
+        threads: 0 for all. The result does not depend on it.
     """
-    color, total = np.zeros((*z.shape, 3), np.float32), np.zeros(z.shape, np.float32)
-    confidence = np.zeros(z.shape, np.float32)
-    distances = view_distances(T_map_camera, np.stack([v.T_map_camera for v in views]), float(np.median(z)))
-    for rank, index in enumerate(np.argsort(distances, kind="stable")[:count]):
-        trust = float(np.clip(1.5 - distances[index] / reach, 0, 1))
-        if trust == 0 or (rank > 1 and (confidence >= trust).sum() > _ENOUGH * surface.sum()):
+    sums = Sums.zeros(z.shape)
+    z, mask = np.ascontiguousarray(z), np.ascontiguousarray(surface).view(np.uint8)
+    for rank, (view, distance) in enumerate(nearest):
+        trust = float(np.clip(1.5 - distance / reach, 0, 1))
+        if trust == 0 or (rank > 1 and (sums.confidence >= trust).sum() > _ENOUGH * surface.sum()):
             break
-        image, covered, agreement = _reproject(views[index], camera, T_map_camera, z, surface)
-        np.maximum(confidence, trust * covered, out=confidence)
-        weight = covered * agreement * np.float32(1 / (distances[index] ** 2 + 1e-5))
-        color += cv2.multiply(image, cv2.merge([weight] * 3), dtype=cv2.CV_32F)
-        total += weight
-    return Detail(color / np.maximum(total, 1e-12)[..., None], confidence, total > 0)
+        A, b = _motion(view, camera, T_map_camera)
+        native().blend_view(
+            *(z, mask, view.image, view.z, view.step, A, b, trust, weight_of(distance)),
+            *((_DOUBT, _OTHER, _FEATHER, _UNKNOWN), sums.color, sums.total, sums.confidence, threads),
+        )
+    return Detail(sums.color / np.maximum(sums.total, 1e-12)[..., None], sums.confidence, sums.total > 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Sums:
+    """What is added up over keyframes, changed in place."""
+
+    color: Float32  # [H, W, 3]
+    total: Float32  # [H, W] of the weights
+    confidence: Float32  # [H, W] the largest trust
+
+    @staticmethod
+    def zeros(shape: tuple[int, ...]) -> Sums:
+        """Before the first keyframe."""
+        return Sums(np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.float32))
+
+
+def weight_of(distance: float) -> float:
+    """Of a keyframe at a view distance."""
+    return 1 / (distance**2 + 1e-5)
+
+
+def blend_reference(
+    view: KeyframeView,
+    camera: Camera,
+    T_map_camera: Float64,
+    z: Float32,
+    surface: NDArray[np.bool_],
+    trust: float,
+    weight: float,
+    sums: Sums,
+) -> None:
+    """What the kernel ``blend_view`` computes, by numpy and OpenCV (whose samples lie on a grid of 1/32 px)."""
+    image, covered, agreement = _reproject(view, camera, T_map_camera, z, surface)
+    np.maximum(sums.confidence, np.float32(trust) * covered, out=sums.confidence)
+    share = covered * agreement * np.float32(weight)
+    sums.color[:] += image * share[..., None]
+    sums.total[:] += share
+
+
+def _motion(view: KeyframeView, camera: Camera, T_map_camera: Float64) -> tuple[Float32, Float32]:
+    """A [3, 3] and b [3]: a pixel [u v 1] at depth z is (A [u v 1] z + b) of the view, before the division."""
+    T = se3.inverse(view.T_map_camera) @ T_map_camera
+    A = (view.camera.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32)
+    return A, (view.camera.K @ T[:3, 3]).astype(np.float32)
 
 
 def _reproject(
@@ -82,9 +138,7 @@ def _reproject(
     Returns:
         Its colour [H, W, 3]; whether it saw that surface, faded at its border, [H, W]; how well its depth agrees, 0..1.
     """
-    T = se3.inverse(view.T_map_camera) @ T_map_camera
-    A = (view.camera.K @ T[:3, :3] @ np.linalg.inv(camera.K)).astype(np.float32)
-    b = (view.camera.K @ T[:3, 3]).astype(np.float32)
+    A, b = _motion(view, camera, T_map_camera)
     u = np.arange(camera.width, dtype=np.float32)[None] + np.float32(0.5)
     v = np.arange(camera.height, dtype=np.float32)[:, None] + np.float32(0.5)
     x, y, d = (z * (A[i, 0] * u + (A[i, 1] * v + A[i, 2])) + b[i] for i in range(3))

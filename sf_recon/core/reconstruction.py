@@ -153,7 +153,7 @@ class Reconstruction:
         """Depth [H, W] m of the surface seen from a pose, NaN = hole."""
         if self._points is None:
             return np.full((camera.height, camera.width), np.nan, np.float32)
-        return self._renderer.depth(camera, T_map_camera)[0]
+        return self._renderer.depth(camera, T_map_camera, self.views)[0]
 
     def render(self, camera: Camera, T_map_camera: Float64, *, full: bool = False) -> RenderedView:
         """Draw the surface from a pose; ``full`` adds normals and the variance of the depth."""

@@ -13,12 +13,13 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Scale, UInt8
 from sf_recon.config import ReconConfig
 from sf_recon.core.color_field import ColorField
-from sf_recon.core.detail import detail
+from sf_recon.core.detail import detail, nearest_views
 from sf_recon.core.ipr_reference import normals_of
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.neural_points import NeuralPoints
 from sf_recon.core.observation import backproject
 from sf_recon.core.rasterizer import make_rasterizer, raster_options
+from sf_recon.core.silhouette import sharpen
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +58,12 @@ def fill(z: Float32) -> Float32:
     return np.where(hole, table[label], z)
 
 
+def _middle(z: Float32) -> float:
+    """The median of what is drawn of a depth image, m; 1 m where nothing is."""
+    drawn = z[np.isfinite(z)]
+    return float(np.median(drawn)) if len(drawn) else 1.0
+
+
 class Renderer:
     """Draws views of neural points; holds no state of its own."""
 
@@ -64,10 +71,10 @@ class Renderer:
         self.config, self.points, self.field = config, points, field
         self._draw = make_rasterizer(config)
 
-    def depth(self, camera: Camera, T_map_camera: Float64) -> tuple[Float32, UInt8]:
+    def depth(self, camera: Camera, T_map_camera: Float64, views: Sequence[KeyframeView] = ()) -> tuple[Float32, UInt8]:
         """Depth [H, W] m of the first layer, NaN = hole, and the level of the points that drew it, [H, W].
 
-        Coarse points are drawn where no finer ones stand.
+        Coarse points are drawn where no finer ones stand. With ``views``, the nearest of them sharpen its borders.
         """
         T_camera_map = se3.inverse(T_map_camera)
         z = np.full((camera.height, camera.width), np.nan, np.float32)
@@ -81,7 +88,19 @@ class Renderer:
             with np.errstate(invalid="ignore"):
                 nearer = np.isfinite(other) & (np.isnan(z) | (other + options.layer_gap < z))
             z[nearer], levels[nearer] = other[nearer], index
+        if self.config.sharpen and len(views):
+            z = self._sharpened(z, levels, camera, T_map_camera, views)
         return z, levels
+
+    def _sharpened(
+        self, z: Float32, levels: UInt8, camera: Camera, T_map_camera: Float64, views: Sequence[KeyframeView]
+    ) -> Float32:
+        deciding = [view for view, _ in nearest_views(views, T_map_camera, _middle(z), self.config.sharpen)]
+        spacing = np.array([level.spacing for level in self.points.levels], np.float32)[levels]
+        with np.errstate(invalid="ignore"):
+            half = 0.5 * self.config.coverage * spacing * np.float32(max(camera.fx, camera.fy)) / z
+        gap = self.config.layer_gap * self.points.levels[0].spacing
+        return sharpen(z, half, gap, deciding, camera, T_map_camera)
 
     def render(
         self,
@@ -94,11 +113,12 @@ class Renderer:
     ) -> RenderedView:
         """Draw the surface from a pose, ``full`` with normals and variance."""
         c = self.config
-        z, levels = self.depth(camera, T_map_camera)
+        z, levels = self.depth(camera, T_map_camera, views)
         surface = np.isfinite(z)
         image, trust = np.zeros((*z.shape, 3), np.float32), np.zeros(z.shape, np.float32)
         if c.detail and len(views) and surface.any():
-            found = detail(views, camera, T_map_camera, fill(z), surface, count=c.detail, reach=c.detail_reach)
+            nearest = nearest_views(views, T_map_camera, _middle(z), c.detail)
+            found = detail(nearest, camera, T_map_camera, fill(z), surface, reach=c.detail_reach, threads=c.threads)
             image, trust = found.color, found.confidence
             if not c.fill_holes:
                 image[~surface] = 0

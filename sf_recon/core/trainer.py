@@ -19,14 +19,14 @@ BETAS = (0.9, 0.99)
 EPSILON = 1e-3  # about the gradient of one grey level: smaller ones are noise, which Adam must not blow up
 JUMP_FACTOR = 10.0
 BLIND = 4  # every so many pixels learns the colour seen from no side, which the exported surface shows
-_HALF_MAX, _HALF_MIN = 6e4, 1e-7  # range of the moments, which are kept in half precision
 
 
 class RowAdam:
-    """Adam over the rows of a growing table, which steps only the rows that were touched.
+    """Adam over the rows of a growing table, lazy: a row that no training pixel touched rests, its moments too.
 
     Each row counts its own steps, so a point placed late gets the same bias correction as an early one. Moments
-    are half precision (the second one as its root): 4 bytes per feature instead of 8.
+    are half precision (the second one as its root): 4 bytes per feature instead of 8. Where every row is touched
+    every time this is Adam, up to the rounding of the moments.
     """
 
     def __init__(self, columns: int) -> None:
@@ -52,30 +52,21 @@ class RowAdam:
         """Memory of the moments."""
         return self.mean.nbytes + self.root.nbytes + self.steps.nbytes
 
-    def step(self, table: Tensor, near: Neighbourhood, gradient: Tensor, rate: float) -> None:
+    def step(self, table: Tensor, near: Neighbourhood, gradient: Tensor, rate: float, threads: int = 0) -> None:
         """Move the rows that were interpolated, given the loss gradient [N, C] of the interpolated values."""
-        touched, local = np.unique(near.ids.numpy(), return_inverse=True)
-        sums = np.zeros((len(touched), table.shape[1]), np.float32)
-        used = native().accumulate_rows(
-            local.reshape(near.ids.shape).astype(np.int32),
+        native().adam_rows(
+            near.ids.numpy(),
             near.weights.numpy(),
             gradient.contiguous().numpy(),
-            sums,
-            np.zeros(len(touched), np.uint8),
+            table.numpy(),
+            self.mean.numpy().view(np.uint16),
+            self.root.numpy().view(np.uint16),
+            self.steps.numpy(),
+            rate,
+            *BETAS,
+            EPSILON,
+            threads,
         )
-        if len(used) == 0:
-            return
-        rows, g = torch.from_numpy(touched[used].astype(np.int64)), torch.from_numpy(sums[used])
-        mean = torch.lerp(g, self.mean[rows].float(), BETAS[0])
-        square = torch.lerp(g * g, self.root[rows].float().square(), BETAS[1])
-        steps = (self.steps[rows] + 1).clamp(max=30000)
-        self.mean[rows] = mean.clamp(-_HALF_MAX, _HALF_MAX).half()
-        self.root[rows] = square.sqrt().clamp(_HALF_MIN, _HALF_MAX).half()
-        self.steps[rows] = steps
-        count = steps.float()
-        correct_mean = (1 - BETAS[0] ** count)[:, None]
-        correct_square = (1 - BETAS[1] ** count)[:, None]
-        table[rows] -= rate * (mean / correct_mean) / ((square / correct_square).sqrt() + EPSILON)
 
 
 class Trainer:
@@ -134,5 +125,5 @@ class Trainer:
         assert encoded.grad is not None
         gradients = torch.split(encoded.grad, [f.shape[1] for f in self.field.features], dim=1)
         for adam, table, n, gradient in zip(self.rows, self.field.features, near, gradients, strict=True):
-            adam.step(table, n, gradient, factor * self.feature_rate)
+            adam.step(table, n, gradient, factor * self.feature_rate, self.field.threads)
         return view, float(loss.detach())

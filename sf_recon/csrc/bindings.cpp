@@ -2,9 +2,11 @@
 // Python module sf_recon._native: arrays in, arrays out. Bad shapes are a TypeError, bad coordinates an IndexError.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
+#include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <memory>
 #include <mutex>
@@ -16,6 +18,7 @@
 #include "ipr_cpu.hpp"
 #include "point_grid.hpp"
 #include "rows.hpp"
+#include "view_blend.hpp"
 
 namespace nb = nanobind;
 
@@ -29,12 +32,19 @@ using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::devi
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using MutableRows = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
 using Ids = nb::ndarray<const int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Marks = nb::ndarray<uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Values = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Vector = nb::ndarray<const float, nb::shape<3>, nb::c_contig, nb::device::cpu>;
 using Matrix4 = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
 using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
-using Steps = nb::ndarray<float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Halves = nb::ndarray<uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Steps = nb::ndarray<int16_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Matrix3 = nb::ndarray<const float, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
+using Grid2 = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Mask = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<const uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using Bytes = nb::ndarray<const uint8_t, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
+using MutableGrid = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
+using MutableImage = nb::ndarray<float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
 template <class T>
 using Out = nb::ndarray<nb::numpy, T>;
 
@@ -106,32 +116,36 @@ Out<float> interpolate(Rows table, Ids ids, Rows weights, int threads) {
     return give(std::move(out), {n, columns});
 }
 
-std::vector<int64_t> accumulate(Ids ids, Rows weights, Rows gradient, MutableRows sums, Marks marks) {
-    const size_t n = ids.shape(0), k = ids.shape(1), columns = gradient.shape(1), rows = sums.shape(0);
-    if (weights.shape(0) != n || weights.shape(1) != k || gradient.shape(0) != n || sums.shape(1) != columns ||
-        marks.shape(0) != rows)
-        throw nb::value_error("accumulate_rows: shapes do not agree");
-    std::vector<int64_t> touched;
-    if (!sf::accumulate_rows(ids.data(), weights.data(), n, k, gradient.data(), columns, sums.data(), marks.data(),
-                             rows, touched))
-        throw nb::index_error("accumulate_rows: id out of range");
-    return touched;
+void adam_rows(Ids ids, Rows weights, Rows gradient, MutableRows table, Halves mean, Halves root, Steps steps,
+               float rate, float beta1, float beta2, float epsilon, int threads) {
+    const size_t n = ids.shape(0), k = ids.shape(1), rows = table.shape(0), columns = table.shape(1);
+    if (weights.shape(0) != n || weights.shape(1) != k || gradient.shape(0) != n || gradient.shape(1) != columns)
+        throw nb::value_error("adam_rows: ids, weights and gradient do not fit");
+    for (const Halves& moment : {mean, root})
+        if (moment.shape(0) != rows || moment.shape(1) != columns)
+            throw nb::value_error("adam_rows: table and moments differ in shape");
+    if (steps.shape(0) != rows) throw nb::value_error("adam_rows: steps and table differ in length");
+    const sf::AdamTable all{table.data(), mean.data(), root.data(), steps.data(), rows, columns};
+    if (!sf::adam_rows(ids.data(), weights.data(), n, k, gradient.data(), all, {rate, beta1, beta2, epsilon}, threads))
+        throw nb::index_error("adam_rows: id out of range");
 }
 
-Out<int64_t> accumulate_rows(Ids ids, Rows weights, Rows gradient, MutableRows sums, Marks marks) {
-    return give(accumulate(ids, weights, gradient, sums, marks));
-}
-
-void adam_rows(Ids ids, Rows weights, Rows gradient, MutableRows table, MutableRows mean, MutableRows square,
-               Steps steps, MutableRows sums, Marks marks, float rate, float beta1, float beta2, float epsilon,
-               int threads) {
-    for (const MutableRows& other : {table, mean, square})
-        if (other.shape(0) != sums.shape(0) || other.shape(1) != sums.shape(1))
-            throw nb::value_error("adam_rows: table, moments and sums differ in shape");
-    if (steps.shape(0) != sums.shape(0)) throw nb::value_error("adam_rows: steps and sums differ in length");
-    const std::vector<int64_t> touched = accumulate(ids, weights, gradient, sums, marks);
-    sf::adam_rows(touched, sums.shape(1), {rate, beta1, beta2, epsilon}, sums.data(), table.data(), mean.data(),
-                  square.data(), steps.data(), threads);
+void blend_view(Grid2 z, Mask surface, Bytes image, Counts depth, float step, Matrix3 A, Vector b, float trust,
+                float weight, const std::array<float, 4>& rules, MutableImage color, MutableGrid total,
+                MutableGrid confidence, int threads) {
+    const size_t height = z.shape(0), width = z.shape(1);
+    const auto fits = [&](const auto& other) { return other.shape(0) == height && other.shape(1) == width; };
+    if (!fits(surface) || !fits(color) || !fits(total) || !fits(confidence))
+        throw nb::value_error("blend_view: images of the drawn view differ in size");
+    if (image.shape(0) != depth.shape(0) || image.shape(1) != depth.shape(1) || image.size() == 0)
+        throw nb::value_error("blend_view: image and depth of the keyframe differ in size or are empty");
+    sf::SourceView view{image.data(), depth.data(), step, static_cast<int>(image.shape(1)),
+                        static_cast<int>(image.shape(0)), {}, {}, trust, weight};
+    std::copy(A.data(), A.data() + 9, view.A);
+    std::copy(b.data(), b.data() + 3, view.b);
+    const nb::gil_scoped_release release;
+    sf::blend_view(z.data(), surface.data(), static_cast<int>(width), static_cast<int>(height), view,
+                   {rules[0], rules[1], rules[2], rules[3]}, color.data(), total.data(), confidence.data(), threads);
 }
 
 // A network of Python arrays, checked and kept alive.
@@ -277,13 +291,15 @@ NB_MODULE(_native, m) {
         .def("add", &add, nb::arg("points"))
         .def("knn", &knn, nb::arg("queries"), nb::arg("k"), nb::arg("radius"), nb::arg("threads") = 0);
     m.def("voxel_means", &voxel_means, nb::arg("rows"), nb::arg("cell_size"));
-    m.def("accumulate_rows", &accumulate_rows, nb::arg("ids"), nb::arg("weights"), nb::arg("gradient"),
-          nb::arg("sums").noconvert(), nb::arg("marks").noconvert());
     m.def("interpolate", &interpolate, nb::arg("table"), nb::arg("ids"), nb::arg("weights"), nb::arg("threads") = 0);
     m.def("adam_rows", &adam_rows, nb::arg("ids"), nb::arg("weights"), nb::arg("gradient"),
-          nb::arg("table").noconvert(), nb::arg("mean").noconvert(), nb::arg("square").noconvert(),
-          nb::arg("steps").noconvert(), nb::arg("sums").noconvert(), nb::arg("marks").noconvert(), nb::arg("rate"),
-          nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"), nb::arg("threads") = 0);
+          nb::arg("table").noconvert(), nb::arg("mean").noconvert(), nb::arg("root").noconvert(),
+          nb::arg("steps").noconvert(), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"), nb::arg("epsilon"),
+          nb::arg("threads") = 0);
+    m.def("blend_view", &blend_view, nb::arg("z"), nb::arg("surface"), nb::arg("image"), nb::arg("depth"),
+          nb::arg("step"), nb::arg("A"), nb::arg("b"), nb::arg("trust"), nb::arg("weight"), nb::arg("rules"),
+          nb::arg("color").noconvert(), nb::arg("total").noconvert(), nb::arg("confidence").noconvert(),
+          nb::arg("threads") = 0);
     m.def("decode_colors", &decode_colors, nb::arg("queries"), nb::arg("levels"), nb::arg("layers"),
           nb::arg("neighbours"), nb::arg("eye") = nb::none(), nb::arg("degree") = 0, nb::arg("base") = nb::none(),
           nb::arg("extra") = nb::none(), nb::arg("threads") = 0);

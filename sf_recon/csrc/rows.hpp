@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// Tables with one row per point: interpolation, its transpose, Adam on the rows touched, means of cells.
+// Tables with one row per point: interpolation, Adam on the rows that it touched, means of cells.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -12,19 +12,23 @@ namespace sf {
 bool interpolate(const float* table, size_t rows, size_t columns, const int32_t* ids, const float* weights, size_t n,
                  size_t k, float* out, int threads);
 
-// The transpose: sums[ids[i, j]] += weights[i, j] * gradient[i], in order. `touched` gets the rows in order of first
-// touch; `marks` [rows] is 0 between calls. False when an id is no row.
-bool accumulate_rows(const int32_t* ids, const float* weights, size_t n, size_t k, const float* gradient,
-                     size_t columns, float* sums, uint8_t* marks, size_t rows, std::vector<int64_t>& touched);
-
 struct AdamRates {
     float rate, beta1, beta2, epsilon;
 };
 
-// One step of Adam on the touched rows of a table by their gradient in `sums`, which is then 0 again. Each row counts
-// its own steps. table, mean, square, sums [rows, columns]; steps [rows].
-void adam_rows(const std::vector<int64_t>& touched, size_t columns, const AdamRates& rates, float* sums, float* table,
-               float* mean, float* square, float* steps, int threads);
+struct AdamTable {  // a table [rows, columns] and its moments; 4 bytes per value and 2 per row
+    float* values;
+    uint16_t *mean, *root;  // [rows, columns] half floats: first moment, and root of the second
+    int16_t* steps;         // [rows]
+    size_t rows, columns;
+};
+
+// One step of Adam on the rows that were interpolated with ids and weights [n, k], given the gradient [n, columns] of
+// the interpolated values. Lazy: a row that no query touched keeps its value and its moments, and each row counts its
+// own steps. Sums run in the order of the queries, so the result does not depend on threads. False, and nothing is
+// changed, when an id with a weight is no row.
+bool adam_rows(const int32_t* ids, const float* weights, size_t n, size_t k, const float* gradient,
+               const AdamTable& table, const AdamRates& rates, int threads);
 
 // Mean of the rows [n, columns] that fall in each cell of a grid (columns 0-2 are the position), in order of first
 // appearance. Throws std::out_of_range for a position that is not finite or too far away.

@@ -14,6 +14,7 @@ from sf_bringup.eval_files import read_surface
 from sf_bringup.evaluation import Samples, psnr, ssim, surface_error
 from sf_bringup.evaluation.image import Lpips
 from sf_bringup.evaluation.mesh import icp, seen_by_any
+from sf_bringup.evaluation.seen_surface import seen_surface_error
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera
@@ -56,6 +57,23 @@ def test_nice_culling_ignores_what_no_view_sees() -> None:
     assert seen_by_any(edge, camera, poses).tolist() == [True, False, False]
     with pytest.raises(FormatError, match="one frame"):
         surface_error(square(-1.0), wide, (camera, poses), samples=1000)
+
+
+def test_what_is_hidden_does_not_count_and_equal_surfaces_have_no_distance() -> None:
+    camera = Camera(100, 100, 100.0, 100.0, 50.0, 50.0)  # sees the unit square at z = 1, and one hidden behind it
+    poses = np.eye(4)[None]
+    both = Samples(np.concatenate([square(1.0).vertices, square(1.5).vertices]), np.concatenate([SQUARE, SQUARE + 4]))
+    error = seen_surface_error(square(1.0), both, camera, poses, samples=5000)
+    assert error.accuracy == pytest.approx(0, abs=1e-4) and error.completion == pytest.approx(0, abs=1e-4)
+    assert error.completion_ratio == 100 and error.samples == pytest.approx(2500, rel=0.1)
+    off = seen_surface_error(square(1.02), both, camera, poses, samples=5000)
+    assert off.accuracy == pytest.approx(2, abs=1e-3) and off.completion == pytest.approx(2, abs=1e-3)
+    cloud = Samples(square(1.0).draw(50_000), np.zeros((0, 3), np.int64))
+    assert seen_surface_error(cloud, both, camera, poses, samples=5000).completion < 0.4
+    with pytest.raises(FormatError, match="triangles"):
+        seen_surface_error(square(1.0), cloud, camera, poses)
+    with pytest.raises(FormatError, match="one frame"):
+        seen_surface_error(square(-1.0), both, camera, poses, samples=100)
 
 
 def test_icp_finds_a_small_motion() -> None:

@@ -39,6 +39,7 @@ def test_an_exact_run_has_no_error(run: RunFolder, capsys: pytest.CaptureFixture
     assert depth["robust_mvd_all_views"]["inlier"] == 100
     mesh = evaluate(capsys, "mesh", run.path, "--reference", run.path / "mesh.ply")
     assert mesh["nicer_unculled"]["f_score"] == mesh["nice_culled"]["f_score"] == 100
+    assert mesh["seen"]["f_score"] == 100 and mesh["seen"]["accuracy"] < 1e-3
     assert mesh["nice_culled"]["samples"] < 0.95 * mesh["nicer_unculled"]["samples"]
 
 

@@ -15,9 +15,10 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Keyframe, Scale, Trajectory
 from sf_recon.config import ReconConfig
 from sf_recon.core.color_field import Neighbourhood, gaussian_weights
-from sf_recon.core.detail import detail
+from sf_recon.core.detail import Sums, blend_reference, detail, nearest_views, weight_of
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.reconstruction import Reconstruction
+from sf_recon.core.silhouette import sharpen
 from sf_recon.core.trainer import EPSILON, RowAdam
 from tests.recon.scene import CAMERA, HALF, psnr, view
 
@@ -81,9 +82,10 @@ def test_a_keyframe_says_nothing_about_what_it_did_not_see(room: Reconstruction)
     z = np.array(key.depth.z)
     blank = KeyframeView.make(0, CAMERA, key.T_map_camera, np.zeros((120, 160, 3), np.uint8), z, None)
     surface = np.ones(z.shape, bool)
-    seen = detail([blank], CAMERA, key.T_map_camera, z, surface, count=1, reach=0.5)
-    behind = detail([blank], CAMERA, key.T_map_camera, 2.0 * z, surface, count=1, reach=0.5)
-    away = detail([blank], CAMERA, view(9).T_map_camera, z, surface, count=1, reach=0.5)
+    far = nearest_views([blank], view(9).T_map_camera, 2.0, 1)
+    seen = detail([(blank, 0.0)], CAMERA, key.T_map_camera, z, surface, reach=0.5)
+    behind = detail([(blank, 0.0)], CAMERA, key.T_map_camera, 2.0 * z, surface, reach=0.5)
+    away = detail(far, CAMERA, view(9).T_map_camera, z, surface, reach=0.5)
     assert seen.confidence[20:-20, 20:-20].min() == 1 and not behind.known.any() and not away.known.any()
 
 
@@ -284,3 +286,43 @@ def test_row_adam_equals_adam_and_keeps_moments_when_it_grows() -> None:
             table = torch.cat([table, torch.zeros(3, 3)])
     torch.testing.assert_close(table[:4], parameter.detach(), rtol=2e-3, atol=3e-4)  # moments are half precision
     assert not table[4:].any() and rows.steps.tolist() == [6] * 4 + [0] * 3
+
+
+def test_the_compiled_blend_equals_its_definition(room: Reconstruction) -> None:
+    rng = np.random.default_rng(0)
+    key = view(0)
+    z = np.array(key.depth.z) * rng.uniform(0.9, 1.2, key.depth.z.shape).astype(np.float32)
+    surface = rng.random(z.shape) < 0.8
+    z[5, 5] = 1e-9  # behind or at the camera of some keyframe
+    chosen = nearest_views(room.views, key.T_map_camera, 2.0, 4)
+    sums = Sums.zeros(z.shape)
+    for kept, distance in chosen:
+        trust = float(np.clip(1.5 - distance, 0, 1))
+        blend_reference(kept, CAMERA, key.T_map_camera, z, surface, trust, weight_of(distance), sums)
+    one, two = (detail(chosen, CAMERA, key.T_map_camera, z, surface, reach=1.0, threads=n) for n in (1, 2))
+    assert np.array_equal(one.color, two.color) and np.array_equal(one.confidence, two.confidence)
+    expected = sums.color / np.maximum(sums.total, 1e-12)[..., None]
+    same = np.isclose(one.confidence, sums.confidence, atol=1e-4)
+    assert same.mean() > 0.999 and (one.known == (sums.total > 0)).mean() > 0.999
+    difference = np.abs(one.color - expected)[same].max(axis=1)
+    assert np.quantile(difference, 0.995) < 1.0 and difference.mean() < 0.1  # grey levels; OpenCV's grid of 1/32 px
+
+
+def test_keyframes_cut_a_near_surface_back_to_its_border() -> None:
+    """A near square drawn 4 px too wide before a wall; a keyframe saw how wide it is."""
+    truth = np.full((120, 160), 3.0, np.float32)
+    truth[40:80, 60:100] = 1.0
+    key = KeyframeView.make(0, CAMERA, np.eye(4), np.zeros((120, 160, 3), np.uint8), truth, None)
+    drawn = np.full_like(truth, 3.0)
+    drawn[36:84, 56:104] = 1.0
+    drawn[0, :5] = np.nan
+    half = np.where(drawn == 1.0, 4.0, 0.5).astype(np.float32)
+    here = np.eye(4)
+    out = sharpen(drawn, half, 0.02, [key], CAMERA, here)
+    assert np.isnan(out[0, :5]).all()
+    np.testing.assert_allclose(out[1:], truth[1:], rtol=1e-4)
+    assert np.array_equal(sharpen(drawn, half, 0.02, [], CAMERA, here), drawn, equal_nan=True)
+    blind = KeyframeView.make(0, CAMERA, np.eye(4), key.image, np.full_like(truth, np.nan), None)
+    assert np.array_equal(sharpen(drawn, half, 0.02, [blind], CAMERA, here), drawn, equal_nan=True)
+    short = np.full_like(half, 2.0)  # the windows explain only two of the four pixels
+    assert (sharpen(drawn, short, 0.02, [key], CAMERA, here)[38:82, 58:102] != 1.0).sum() == 0

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-KERNELS = ("color_decoder", "ipr_bins", "ipr_cpu", "point_grid", "rows")
+KERNELS = ("color_decoder", "ipr_bins", "ipr_cpu", "point_grid", "rows", "view_blend")
 # Run-time choice of vectors is off: it picks the function before the sanitizer has started.
 FLAGS = [
     "-std=c++17",

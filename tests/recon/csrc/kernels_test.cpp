@@ -13,6 +13,7 @@
 #include "ipr_cpu.hpp"
 #include "point_grid.hpp"
 #include "rows.hpp"
+#include "view_blend.hpp"
 
 namespace {
 
@@ -112,14 +113,15 @@ void tables() {
     expect(sf::interpolate(table.data(), 100, 3, ids.data(), weights.data(), 3, 2, out.data(), 2), "interpolate");
     const float ones[2] = {1.0f, 1.0f};
     expect(!sf::interpolate(table.data(), 100, 3, &ids[4], ones, 1, 2, out.data(), 1), "an id below the table");
-    std::vector<float> sums(300), values = table, mean(300), square(300), steps(100);
-    std::vector<uint8_t> marks(100);
-    std::vector<int64_t> touched;
-    expect(!sf::accumulate_rows(&ids[4], ones, 1, 2, out.data(), 3, sums.data(), marks.data(), 100, touched), "an id");
-    expect(sf::accumulate_rows(ids.data(), ones, 1, 2, out.data(), 3, sums.data(), marks.data(), 100, touched), "sums");
-    steps[99] = 1e6f;
-    sf::adam_rows(touched, 3, {0.01f, 0.9f, 0.99f, 1e-15f}, sums.data(), values.data(), mean.data(), square.data(),
-                  steps.data(), 2);
+    std::vector<float> values = table;
+    std::vector<uint16_t> mean(300), root(300);
+    std::vector<int16_t> steps(100);
+    const sf::AdamTable all{values.data(), mean.data(), root.data(), steps.data(), 100, 3};
+    const sf::AdamRates rates{0.01f, 0.9f, 0.99f, 1e-3f};
+    expect(!sf::adam_rows(&ids[4], ones, 1, 2, out.data(), all, rates, 1) && values == table, "an id below the table");
+    steps[99] = 32767;
+    expect(sf::adam_rows(ids.data(), ones, 1, 2, out.data(), all, rates, 2), "a step");
+    expect(steps[0] == 1 && steps[5] == 0 && values[0] != table[0] && values[15] == table[15], "rows that rest");
     expect(sf::voxel_means(table.data(), 100, 3, 0.5f).size() % 3 == 0, "means");
     try {
         sf::voxel_means(&kNan, 0, 3, 0.5f);
@@ -152,6 +154,23 @@ void decoder() {
     expect(sf::decode_image(network, queries.data(), 0, 0, T, colors.data(), 2), "an empty image");
 }
 
+void blend() {
+    const int width = 37, height = 11;
+    std::vector<float> z(width * height, 1.0f), color(3 * width * height), total(width * height), trust(width * height);
+    const float hostile[] = {0.0f, kTiny, -1.0f, kMax, kInf, kNan, 1e-7f};
+    for (size_t i = 0; i < 7; ++i) z[30 * i] = hostile[i];
+    const std::vector<uint8_t> surface(width * height, 1), image(3 * 5 * 3, 200);
+    const std::vector<uint16_t> depth(5 * 3, 1000);
+    for (const float focal : {0.0f, 1.0f, 1e30f, kNan}) {
+        const sf::SourceView view{image.data(), depth.data(), 1e-3f, 5, 3, {focal, 0, 0, 0, focal, 0, 0, 0, 1},
+                                  {1, 1, 0}, 1.0f, 2.0f};
+        sf::blend_view(z.data(), surface.data(), width, height, view, {0.05f, 0.3f, 16.0f, 0.1f}, color.data(),
+                       total.data(), trust.data(), 2);
+    }
+    for (size_t i = 0; i < total.size(); ++i)
+        expect(total[i] >= 0.0f && trust[i] <= 1.0f && std::abs(color[3 * i] - 200.0f * total[i]) < 0.1f, "a blend");
+}
+
 }  // namespace
 
 int main() {
@@ -159,5 +178,6 @@ int main() {
     grid();
     tables();
     decoder();
+    blend();
     std::puts("all kernels behave");
 }

@@ -1,0 +1,109 @@
+"""A map of half a million points that is looked at while it learns: steps, frames a second, time to a PSNR, memory.
+
+    python benchmarks/live_map.py FOLDER/rgbd_7scenes_redkitchen_000_199 [--resolution 0.004] [--seconds 4]
+
+All keyframes but the last are placed and trained as a line does it. Then: optimiser steps a second of the trainer
+alone; frames a second at 640x480 from the poses of held-out frames, with the JPEG of the viewer, while the map rests
+and while it learns; and how long the last keyframes take from their arrival to 25 dB in the learning thread.
+"""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from colour import load
+from common import Benchmark, print_rows
+
+from sf_interfaces.types import Keyframe
+from sf_recon.config import ReconConfig
+from sf_recon.core.learner import FairLock, Learner
+from sf_recon.core.memory import points_bytes
+from sf_recon.core.reconstruction import Reconstruction
+
+LAST = 3  # keyframes whose time to the goal is measured
+
+
+def per_second(call: Callable[[], Any], seconds: float) -> float:
+    """Calls a second, after one that warms up."""
+    call()
+    started, count = time.perf_counter(), 0
+    while time.perf_counter() - started < seconds:
+        call()
+        count += 1
+    return count / (time.perf_counter() - started)
+
+
+def drawing(built: Reconstruction, held: list[Keyframe], lock: AbstractContextManager[Any]) -> Callable[[], None]:
+    """Draws the next held-out view as the viewer does it."""
+    views = cycle(held)
+
+    def draw() -> None:
+        frame = next(views)
+        with lock:
+            image = built.render(frame.camera, frame.T_map_camera).image
+        cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 85])
+
+    return draw
+
+
+def to_goal(built: Reconstruction, keys: list[Keyframe], lock: FairLock, patience: float) -> tuple[list[float], float]:
+    """Seconds from arrival to the goal of keyframes that come one after another; and iterations a second."""
+    learner = Learner(built, lock)
+    for key in keys:
+        came = time.monotonic()
+        with lock:
+            built.place(key)
+        learner.arrived(key.stamp_ns, came)
+        while key.stamp_ns not in learner.reached and time.monotonic() - came < patience:
+            time.sleep(0.01)
+    learner.stop()
+    return [learner.reached.get(key.stamp_ns, float("inf")) for key in keys], learner.timing()["iterations_per_s"]
+
+
+def main() -> None:
+    """One row."""
+    bench = Benchmark("live_map", __doc__ or "")
+    bench.parser.add_argument("data", type=Path, help="folder of a 7-Scenes sequence, or a simulated bag")
+    bench.parser.add_argument("--resolution", type=float, default=0.004, help="m")
+    bench.parser.add_argument("--frames", type=int, default=200)
+    bench.parser.add_argument("--step", type=int, default=8, help="every n-th frame is a keyframe")
+    bench.parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement")
+    args = bench.parse()
+    keys, held = load(args.data, args.frames, args.step)
+    built = Reconstruction(ReconConfig(resolution=args.resolution, iterations=10))
+    for key in keys[:-LAST]:
+        built.add(key)
+    assert built.points is not None
+    resting = drawing(built, held, nullcontext())
+    steps, paused = per_second(built.learn, args.seconds), per_second(resting, args.seconds)
+    lock = FairLock()
+    seconds, _ = to_goal(built, keys[-LAST:], lock, 20.0)
+    learner = Learner(built, lock)
+    learner.arrived(0)
+    learning = per_second(drawing(built, held, lock), args.seconds)
+    learner.stop()
+    finest = len(built.points.levels[0])
+    row = {
+        "points": finest,
+        "steps / s": steps,
+        "frames / s, map rests": paused,
+        "frames / s, map learns": learning,
+        "steps / s beside drawing": learner.timing()["iterations_per_s"],
+        "s to 25 dB, median": float(np.median(seconds)),
+        "s to 25 dB, worst": max(seconds),
+        "bytes / finest point": points_bytes(built.points, built._field, built._trainer) / finest,
+    }
+    print_rows([row])
+    bench.write("A map that is looked at while it learns", {f"{len(keys)} keyframes": [row]})
+
+
+if __name__ == "__main__":
+    main()
