@@ -21,6 +21,7 @@ _MIN_Z = 0.05  # of the reference depth; nearer to a source, or behind it, a poi
 _KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
 _LEAST_SIGMA = 0.02  # px; correspondences are never better than this
 _FALL = 1e-4  # relative fall of the cost below which the iteration has converged
+_TILES = (9, 12)  # rows and columns of the tiles that count as independent in the covariance
 _LARGEST_STEP = 4.0  # factor by which one step may change an inverse depth
 
 
@@ -79,13 +80,21 @@ class Adjusted:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Normal equations: H [P, P] and g [P] of poses and intrinsics, C [N] and w [N] of depths, E [P, N] between."""
+    """Normal equations: H [P, P] and g [P] of poses and intrinsics, C [N] and w [N] of depths, E [P, N] between.
+
+    ``scores`` is what each pixel contributes to g, [P, N].
+    """
 
     H: Float64
-    g: Float64
+    scores: Float64
     E: Float64
     C: Float64
     w: Float64
+
+    @property
+    def g(self) -> Float64:
+        """Right side of the poses and intrinsics, [P]."""
+        return np.asarray(self.scores.sum(axis=1))
 
 
 def adjust(
@@ -173,7 +182,7 @@ def linearise(seen: Observations, at: Estimate, weight: Float64, r: Float64, pos
     count, K = len(at.T), columns.shape[1]
     own = 6 * count if poses else 0
     P, N = own + K, seen.uv.shape[1]
-    H, g, E = np.zeros((P, P)), np.zeros(P), np.zeros((P, N))
+    H, scores, E = np.zeros((P, P)), np.zeros((P, N)), np.zeros((P, N))
     C, w = np.zeros(N), np.zeros(N)
     x = pinhole.rays(at.theta, seen.uv)
     dx = pinhole.rays_jacobian(at.theta, x, columns) if K else np.zeros((2, 0, N))
@@ -188,11 +197,11 @@ def linearise(seen: Observations, at: Estimate, weight: Float64, r: Float64, pos
         rows = np.r_[6 * j : 6 * j + 6, own:P] if poses else np.arange(own, P)
         flat = A.reshape(len(rows), 2 * N)
         H[np.ix_(rows, rows)] += flat @ flat.T
-        g[rows] += flat @ b.ravel()
+        scores[rows] += A[:, 0] * b[0] + A[:, 1] * b[1]
         E[rows] += A[:, 0] * a[0] + A[:, 1] * a[1]
         C += a[0] ** 2 + a[1] ** 2
         w += a[0] * b[0] + a[1] * b[1]
-    return System(H, g, E, C, w)
+    return System(H, scores, E, C, w)
 
 
 def jacobians(
@@ -268,11 +277,33 @@ def _with_covariance(
         for j, T in enumerate(at.T):
             gauge[6 * j : 6 * j + 3] = T[:3, 3]
         S += np.trace(S) * np.outer(gauge, gauge) / max(gauge @ gauge, 1e-300)
-    covariance = sigma**2 * np.linalg.pinv(S, hermitian=True) if len(S) else np.zeros((0, 0))
+    scores = system.scores - scaled * system.w  # of poses and intrinsics alone, [P, N]
+    inverse = np.linalg.pinv(S, hermitian=True) if len(S) else S
+    covariance = inverse @ _spread(seen.uv, scores, sigma**2 * S) @ inverse
     common = np.einsum("pn,pn->n", scaled, covariance @ scaled)
     with np.errstate(divide="ignore"):
         variance = sigma**2 / system.C + common
     return Adjusted(at, iterations, sigma, covariance, variance, common, _cost(r, seen.weight, sigma))
+
+
+def _spread(uv: Float64, scores: Float64, independent: Float64) -> Float64:
+    """Covariance [P, P] of the sum of the scores [P, N] of pixels [2, N], never less than the ``independent`` one.
+
+    The errors of neighbouring correspondences are alike, and what the camera model leaves out (a rolling shutter,
+    a lens) is so all over the image; as independent ones they would seem to average out. Tiles of the image take
+    the place of observations instead, as in the cluster-robust estimate of Liang and Zeger.
+    """
+    P = len(scores)
+    low, high = uv.min(axis=1, keepdims=True), uv.max(axis=1, keepdims=True)
+    rows, cols = _TILES
+    col, row = np.minimum(
+        ((uv - low) / np.maximum(high - low, 1e-12) * [[cols], [rows]]).astype(int), [[cols - 1], [rows - 1]]
+    )
+    tile = row * cols + col
+    sums = np.stack([np.bincount(tile, score, rows * cols) for score in scores]) if P else np.zeros((0, 1))
+    count = int((np.bincount(tile) > 0).sum())
+    clustered = sums @ sums.T * (count / max(count - P, 1))
+    return np.asarray(clustered + independent)
 
 
 def rescaled(at: Estimate, factor: float) -> Estimate:

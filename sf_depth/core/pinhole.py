@@ -58,7 +58,8 @@ def moved(theta: Float64, columns: Float64, step: Float64) -> Float64:
 
 
 def rays(theta: Float64, uv: Float64) -> Float64:
-    """Undistorted normalised coordinates [2, N] of pixels [2, N]."""
+    """Undistorted normalised coordinates [2, N] of pixels [2, N], in their precision."""
+    theta = theta.astype(uv.dtype, copy=False)
     x = (uv - theta[2:4, None]) / theta[:2, None]
     k1 = theta[4]
     if k1 == 0.0:
