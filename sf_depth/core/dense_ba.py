@@ -63,7 +63,8 @@ class Adjusted:
         estimate: the optimum.
         iterations: accepted and refused steps.
         sigma: deviation of one coordinate of a correspondence, px.
-        covariance: of poses (translation, rotation; 6 per source, if free) and free intrinsics phi, [P, P].
+        covariance: of poses (translation, rotation; 6 per source, if free) and of f and k1 (or fx fy cx cy), [P, P],
+            free or not: what the camera model leaves out is unsure in given intrinsics, too.
         inverse_depth_variance: [N], with what poses and intrinsics contribute; inf where nothing was seen.
         common_variance: the part of it that comes from poses and intrinsics, [N].
         cost: mean robust cost of an observation, px^2.
@@ -267,7 +268,7 @@ def _with_covariance(
 ) -> Adjusted:
     """Posterior covariance at the optimum. The scale, which nothing observes, counts as known."""
     sigma = _deviation(r, seen.weight)
-    columns = pinhole.free_columns(at.theta, intrinsics)
+    columns = pinhole.free_columns(at.theta, "pinhole" if intrinsics == "pinhole" else "radial")
     system = linearise(seen, at, _robust(r, seen.weight, sigma), r, poses, columns)
     C = system.C + _least_information(system.C)
     scaled = system.E / C
@@ -303,10 +304,25 @@ def _spread(uv: Float64, scores: Float64, independent: Float64) -> Float64:
     sums = np.stack([np.bincount(tile, score, rows * cols) for score in scores]) if P else np.zeros((0, 1))
     count = int((np.bincount(tile) > 0).sum())
     clustered = sums @ sums.T * (count / max(count - P, 1))
-    return np.asarray(clustered + independent)
+    total = scores.sum(axis=1)
+    return np.asarray(clustered + independent + np.outer(total, total))
 
 
-def rescaled(at: Estimate, factor: float) -> Estimate:
+def rescaled(adjusted: Adjusted, factor: float) -> Adjusted:
+    """The same optimum in another unit: translations and depths times ``factor``."""
+    per_parameter = np.ones(len(adjusted.covariance))
+    for j in range(len(adjusted.estimate.T)):
+        per_parameter[6 * j : 6 * j + 3] = factor  # poses are free: without them there is no unit to choose
+    return replace(
+        adjusted,
+        estimate=in_unit(adjusted.estimate, factor),
+        covariance=adjusted.covariance * np.outer(per_parameter, per_parameter),
+        inverse_depth_variance=adjusted.inverse_depth_variance / factor**2,
+        common_variance=adjusted.common_variance / factor**2,
+    )
+
+
+def in_unit(at: Estimate, factor: float) -> Estimate:
     """The same geometry in another unit: translations and depths times ``factor``."""
     T = at.T.copy()
     T[:, :3, 3] *= factor

@@ -22,7 +22,7 @@ _GATE = 3.0  # px at a width of 640; a depth must explain at least one source wi
 _MIN_Z = 0.05
 # Measured against exact and sensor depth, alike on simulated and real images: a correspondence is this much less
 # sure along the epipolar line than its residual across it says, and a depth that few sources confirm less still.
-_COMMON = 3.0
+_COMMON = 2.5
 _UNCHECKED = 0.3  # px at a width of 640, for one source; falls with the square of their number
 
 

@@ -72,10 +72,11 @@ class _Matched:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """The optimum of dense BA and the observations that passed the checks on the way."""
+    """The optimum of dense BA, the observations that passed the checks, and how sure its scale is (relative)."""
 
     adjusted: Adjusted
     seen: Observations
+    scale_deviation: float = 0.0
 
 
 class MultiViewDepth:
@@ -173,8 +174,8 @@ class MultiViewDepth:
         if fit.adjusted.sigma < _NOISY_POSES * free.adjusted.sigma:
             return fit
         at = free.adjusted.estimate
-        scaled = dense_ba.rescaled(at, from_translations(at.T[:, :3, 3], given.T[:, :3, 3]))
-        return _Fit(dense_ba.adjust(free.seen, scaled, poses=False), free.seen)
+        scale = from_translations(at.T[:, :3, 3], given.T[:, :3, 3])
+        return _Fit(dense_ba.rescaled(free.adjusted, scale.factor), free.seen, scale.deviation)
 
 
 def check_images(images: Sequence[UInt8]) -> None:
@@ -267,7 +268,7 @@ def _dense(matched: _Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth
         image[seen] = np.concatenate([getattr(part, name) for part in parts])
     d, variance, support = (image.reshape(size.height, size.width) for image in (d, variance, support))
     common = dense_depth.common_variance(fit.adjusted, fit.seen, matched.grid, (size.height, size.width))
-    return dense_depth.InverseDepth(np.where(lonely(d), np.float32(np.nan), d), variance + common, support)
+    return dense_depth.InverseDepth(np.where(lonely(d, variance), np.float32(np.nan), d), variance + common, support)
 
 
 def registered(seen: Observations) -> np.ndarray:
@@ -291,7 +292,7 @@ def _recovered(
         raise InsufficientParallax(
             f"only {density:.1%} of the pixels can be triangulated; give views with more parallax and more overlap"
         )
-    variance = np.where(np.isfinite(z), z**4 * solved.variance, np.nan)
+    variance = np.where(np.isfinite(z), z**4 * solved.variance + (z * fit.scale_deviation) ** 2, np.nan)
     own = camera or pinhole.camera_of(at.theta, size.width, size.height)
     focal_sigma = 0.0 if camera is not None else dense_depth.focal_deviation(adjusted)
     return Recovered(
