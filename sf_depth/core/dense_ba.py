@@ -15,12 +15,14 @@ import numpy as np
 
 from sf_depth.core import pinhole
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Float64
+from sf_interfaces.types import Float32, Float64
 
 _MIN_Z = 0.05  # of the reference depth; nearer to a source, or behind it, a point says nothing
+_SINGLE = np.float32  # of the normal equations; residuals and the estimate are in double precision
 _KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
 _LEAST_SIGMA = 0.02  # px; correspondences are never better than this
 _FALL = 1e-4  # relative fall of the cost below which the iteration has converged
+_TILES = (9, 12)  # rows and columns of the tiles that count as independent in the covariance
 _LARGEST_STEP = 4.0  # factor by which one step may change an inverse depth
 
 
@@ -62,7 +64,8 @@ class Adjusted:
         estimate: the optimum.
         iterations: accepted and refused steps.
         sigma: deviation of one coordinate of a correspondence, px.
-        covariance: of poses (translation, rotation; 6 per source, if free) and free intrinsics phi, [P, P].
+        covariance: of poses (translation, rotation; 6 per source, if free) and of f and k1 (or fx fy cx cy), [P, P],
+            free or not: what the camera model leaves out is unsure in given intrinsics, too.
         inverse_depth_variance: [N], with what poses and intrinsics contribute; inf where nothing was seen.
         common_variance: the part of it that comes from poses and intrinsics, [N].
         cost: mean robust cost of an observation, px^2.
@@ -79,13 +82,21 @@ class Adjusted:
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Normal equations: H [P, P] and g [P] of poses and intrinsics, C [N] and w [N] of depths, E [P, N] between."""
+    """Normal equations: H [P, P] and g [P] of poses and intrinsics, C [N] and w [N] of depths, E [P, N] between.
+
+    ``scores`` is what each pixel contributes to g, [P, N].
+    """
 
     H: Float64
-    g: Float64
-    E: Float64
-    C: Float64
-    w: Float64
+    scores: Float32
+    E: Float32
+    C: Float32
+    w: Float32
+
+    @property
+    def g(self) -> Float64:
+        """Right side of the poses and intrinsics, [P]."""
+        return np.asarray(self.scores.sum(axis=1, dtype=np.float64))
 
 
 def adjust(
@@ -169,78 +180,74 @@ def _cost(r: Float64, weight: Float64, sigma: float) -> float:
 
 
 def linearise(seen: Observations, at: Estimate, weight: Float64, r: Float64, poses: bool, columns: Float64) -> System:
-    """Normal equations at an estimate, weights [S, N] and residuals [S, 2, N] given."""
+    """Normal equations at an estimate, weights [S, N] and residuals [S, 2, N] given; in single precision."""
     count, K = len(at.T), columns.shape[1]
     own = 6 * count if poses else 0
     P, N = own + K, seen.uv.shape[1]
-    H, g, E = np.zeros((P, P)), np.zeros(P), np.zeros((P, N))
-    C, w = np.zeros(N), np.zeros(N)
-    x = pinhole.rays(at.theta, seen.uv)
-    dx = pinhole.rays_jacobian(at.theta, x, columns) if K else np.zeros((2, 0, N))
+    H, scores, E = np.zeros((P, P)), np.zeros((P, N), _SINGLE), np.zeros((P, N), _SINGLE)
+    C, w = np.zeros(N, _SINGLE), np.zeros(N, _SINGLE)
+    x, d = pinhole.rays(at.theta, seen.uv).astype(_SINGLE), at.inverse_depth.astype(_SINGLE)
+    dx = pinhole.rays_jacobian(at.theta, x, columns) if K else np.zeros((2, 0, N), _SINGLE)
     for j, T in enumerate(at.T):
-        A, a = jacobians(at.theta, T, x, dx, at.inverse_depth, poses, columns)
-        root = np.sqrt(weight[j])
-        blind = weight[j] == 0
-        A *= root
+        A, a = jacobians(at.theta, T, x, dx, d, poses, columns)
+        root = np.sqrt(weight[j]).astype(_SINGLE)
+        A *= root  # 0 where the source is blind, and what was clipped there is finite
         a *= root
-        b = np.where(blind, 0.0, r[j]) * root
-        A[..., blind], a[..., blind] = 0.0, 0.0
+        b = np.where(root > 0, r[j], 0.0).astype(_SINGLE) * root
+        flat = A.reshape(len(A), 2 * N)
         rows = np.r_[6 * j : 6 * j + 6, own:P] if poses else np.arange(own, P)
-        flat = A.reshape(len(rows), 2 * N)
         H[np.ix_(rows, rows)] += flat @ flat.T
-        g[rows] += flat @ b.ravel()
-        E[rows] += A[:, 0] * a[0] + A[:, 1] * a[1]
+        pose, count = slice(6 * j, 6 * j + 6), len(A) - K
+        for total, (first, second) in ((scores, b), (E, a)):
+            part = A[:, 0] * first + A[:, 1] * second
+            total[pose][:count] = part[:count]  # of this source alone
+            total[own:] += part[count:]
         C += a[0] ** 2 + a[1] ** 2
         w += a[0] * b[0] + a[1] * b[1]
-    return System(H, g, E, C, w)
+    return System(H, scores, E, C, w)
 
 
 def jacobians(
     theta: Float64, T: Float64, x: Float64, dx: Float64, d: Float64, poses: bool, columns: Float64
 ) -> tuple[Float64, Float64]:
-    """d Pi / d (pose, phi) [6 + K, 2, N] and d Pi / d d [2, N] of one source."""
+    """d Pi / d (pose, phi) [6 + K, 2, N] and d Pi / d d [2, N] of one source, in the precision of ``x``."""
+    theta, T, columns = (array.astype(x.dtype, copy=False) for array in (theta, T, columns))
     X = _transformed(T, x, d)
     inverse_z = 1.0 / np.maximum(X[2], _MIN_Z)
     y = X[:2] * inverse_z
     uu, uv, vv = pinhole.project_jacobian(theta, y)
-    first, second = theta[0] * inverse_z, theta[1] * inverse_z
-
-    def through(v: Float64 | tuple[Float64, ...]) -> tuple[Float64, Float64]:
-        """d uv for a motion v [3, ...] of the transformed point."""
-        p, q = v[0] - y[0] * v[2], v[1] - y[1] * v[2]
-        return first * (uu * p + uv * q), second * (uv * p + vv * q)
-
-    A = np.empty(((6 if poses else 0) + columns.shape[1], 2, len(d)))
+    J = np.empty((3, 2, len(d)), x.dtype)  # d uv / d (point in the source)
+    J[0] = theta[0] * inverse_z * uu, theta[1] * inverse_z * uv
+    J[1] = theta[0] * inverse_z * uv, theta[1] * inverse_z * vv
+    J[2] = -(y[0] * J[0] + y[1] * J[1])
+    A = np.empty(((6 if poses else 0) + columns.shape[1], 2, len(d)), x.dtype)
     if poses:
-        zero, one = np.zeros_like(d), np.ones_like(d)
-        for k, direction in enumerate(((one, zero, zero), (zero, one, zero), (zero, zero, one))):
-            A[k] = through(direction)
-            A[k] *= d  # translations act on the point of unit ray in proportion to its inverse depth
-        A[3] = through((zero, -X[2], X[1]))
-        A[4] = through((X[2], zero, -X[0]))
-        A[5] = through((-X[1], X[0], zero))
+        A[:3] = J * d  # translations act on the point of unit ray in proportion to its inverse depth
+        A[3] = X[1] * J[2] - X[2] * J[1]
+        A[4] = X[2] * J[0] - X[0] * J[2]
+        A[5] = X[0] * J[1] - X[1] * J[0]
     if columns.shape[1]:
         own = pinhole.project_parameters(theta, y, columns)
         for k in range(columns.shape[1]):
-            A[k - columns.shape[1]] = through(T[:3, :2] @ dx[:, k])
-            A[k - columns.shape[1]] += own[:, k]
+            v = T[:3, :2] @ dx[:, k]
+            A[k - columns.shape[1]] = v[0] * J[0] + v[1] * J[1] + v[2] * J[2] + own[:, k]
     t = T[:3, 3]
-    return A, np.stack(through((np.full_like(d, t[0]), np.full_like(d, t[1]), np.full_like(d, t[2]))))
+    return A, t[0] * J[0] + t[1] * J[1] + t[2] * J[2]
 
 
 def step(system: System, damping: float) -> tuple[Float64, Float64]:
     """Damped step (dx [P], dd [N]); damping is relative to each diagonal, so it scales with the residuals."""
-    C = system.C * (1.0 + damping) + _least_information(system.C)
+    C = system.C * _SINGLE(1.0 + damping) + _least_information(system.C)
     scaled = system.E / C
     S = system.H - scaled @ system.E.T
     S[np.diag_indices_from(S)] += damping * np.diag(system.H) + 1e-12 * np.trace(system.H)
     dx = np.linalg.solve(S, system.g - scaled @ system.w) if len(S) else np.zeros(0)
-    return dx, (system.w - system.E.T @ dx) / C
+    return dx, (system.w - system.E.T @ dx.astype(_SINGLE)) / C
 
 
-def _least_information(C: Float64) -> float:
+def _least_information(C: Float32) -> np.float32:
     """Keeps depths that nothing constrains where they are."""
-    return 1e-6 * float(np.median(C)) + 1e-300
+    return _SINGLE(1e-6 * float(np.median(C)) + 1e-30)
 
 
 def moved(at: Estimate, step: tuple[Float64, Float64], poses: bool, columns: Float64) -> Estimate:
@@ -258,7 +265,7 @@ def _with_covariance(
 ) -> Adjusted:
     """Posterior covariance at the optimum. The scale, which nothing observes, counts as known."""
     sigma = _deviation(r, seen.weight)
-    columns = pinhole.free_columns(at.theta, intrinsics)
+    columns = pinhole.free_columns(at.theta, "pinhole" if intrinsics == "pinhole" else "radial")
     system = linearise(seen, at, _robust(r, seen.weight, sigma), r, poses, columns)
     C = system.C + _least_information(system.C)
     scaled = system.E / C
@@ -268,14 +275,51 @@ def _with_covariance(
         for j, T in enumerate(at.T):
             gauge[6 * j : 6 * j + 3] = T[:3, 3]
         S += np.trace(S) * np.outer(gauge, gauge) / max(gauge @ gauge, 1e-300)
-    covariance = sigma**2 * np.linalg.pinv(S, hermitian=True) if len(S) else np.zeros((0, 0))
-    common = np.einsum("pn,pn->n", scaled, covariance @ scaled)
+    scores = system.scores - scaled * system.w  # of poses and intrinsics alone, [P, N]
+    inverse = np.linalg.pinv(S, hermitian=True) if len(S) else S
+    covariance = inverse @ _spread(seen.uv, scores, sigma**2 * S) @ inverse
+    common = (scaled * (covariance.astype(_SINGLE) @ scaled)).sum(axis=0)
     with np.errstate(divide="ignore"):
         variance = sigma**2 / system.C + common
     return Adjusted(at, iterations, sigma, covariance, variance, common, _cost(r, seen.weight, sigma))
 
 
-def rescaled(at: Estimate, factor: float) -> Estimate:
+def _spread(uv: Float64, scores: Float64, independent: Float64) -> Float64:
+    """Covariance [P, P] of the sum of the scores [P, N] of pixels [2, N], never less than the ``independent`` one.
+
+    The errors of neighbouring correspondences are alike, and what the camera model leaves out (a rolling shutter,
+    a lens) is so all over the image; as independent ones they would seem to average out. Tiles of the image take
+    the place of observations instead, as in the cluster-robust estimate of Liang and Zeger.
+    """
+    P = len(scores)
+    low, high = uv.min(axis=1, keepdims=True), uv.max(axis=1, keepdims=True)
+    rows, cols = _TILES
+    col, row = np.minimum(
+        ((uv - low) / np.maximum(high - low, 1e-12) * [[cols], [rows]]).astype(int), [[cols - 1], [rows - 1]]
+    )
+    tile = row * cols + col
+    sums = np.stack([np.bincount(tile, score, rows * cols) for score in scores]) if P else np.zeros((0, 1))
+    count = int((np.bincount(tile) > 0).sum())
+    clustered = sums @ sums.T * (count / max(count - P, 1))
+    total = scores.sum(axis=1)
+    return np.asarray(clustered + independent + np.outer(total, total))
+
+
+def rescaled(adjusted: Adjusted, factor: float) -> Adjusted:
+    """The same optimum in another unit: translations and depths times ``factor``."""
+    per_parameter = np.ones(len(adjusted.covariance))
+    for j in range(len(adjusted.estimate.T)):
+        per_parameter[6 * j : 6 * j + 3] = factor  # poses are free: without them there is no unit to choose
+    return replace(
+        adjusted,
+        estimate=in_unit(adjusted.estimate, factor),
+        covariance=adjusted.covariance * np.outer(per_parameter, per_parameter),
+        inverse_depth_variance=adjusted.inverse_depth_variance / factor**2,
+        common_variance=adjusted.common_variance / factor**2,
+    )
+
+
+def in_unit(at: Estimate, factor: float) -> Estimate:
     """The same geometry in another unit: translations and depths times ``factor``."""
     T = at.T.copy()
     T[:, :3, 3] *= factor

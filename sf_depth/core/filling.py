@@ -11,10 +11,11 @@ import numpy as np
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.monodepth import MonoDepth, load_monodepth
-from sf_interfaces.types import DepthMap, Keyframe
+from sf_interfaces.types import DepthMap, Float32, Keyframe
 
 # Relative deviation for every image width of distance from triangulated depth: another surface may be there,
-# which no interpolation of what was seen can know.
+# which no interpolation of what was seen can know. What poses and calibration get wrong around a gap they get wrong
+# in it, too: the relative variance of the nearest triangulated pixel is added.
 _UNSEEN = 1.0
 
 
@@ -46,7 +47,18 @@ class Filler:
             guessed = self._model(keyframe.image, keyframe.camera, seen).z
             base = np.nan_to_num(guessed, nan=float(np.nanmedian(guessed)))
         full = self._completer.complete(keyframe, base)
-        assert full.depth is not None and full.depth.variance is not None and seen is not None
-        away = cv2.distanceTransform((~seen.valid).astype(np.uint8), cv2.DIST_L2, 3) / keyframe.camera.width
-        variance = full.depth.variance + (_UNSEEN * away * full.depth.z) ** 2
+        assert full.depth is not None and full.depth.variance is not None
+        assert seen is not None and seen.variance is not None
+        away, owner = _nearest(seen.valid)
+        unseen = (_UNSEEN * away / keyframe.camera.width) ** 2 + (seen.variance / seen.z**2)[owner] * ~seen.valid
+        variance = full.depth.variance + unseen * full.depth.z**2
         return replace(full, depth=DepthMap(full.depth.z, variance, full.depth.scale))
+
+
+def _nearest(valid: np.ndarray) -> tuple[Float32, tuple[np.ndarray, np.ndarray]]:
+    """Distance [H, W] px of every pixel to the nearest valid one, and the row and column of that one."""
+    gaps = (~valid).astype(np.uint8)
+    away, label = cv2.distanceTransformWithLabels(gaps, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    place = np.zeros(int(label.max()) + 1, np.int64)
+    place[label[valid]] = np.flatnonzero(valid)
+    return np.asarray(away), np.unravel_index(place[label], valid.shape)

@@ -8,7 +8,8 @@ the entry-point group ``scenefactory.matchers``.
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Protocol
 
@@ -29,7 +30,8 @@ class Correspondence:
     """Where every reference pixel lies in the source image.
 
     Args:
-        target: continuous source pixels [H, W, 2]; NaN where nothing was found.
+        target: continuous source pixels [H, W, 2]; NaN where nothing was found. A coarse match is half the size,
+            but its pixels are those of the full images.
         back: where the target itself is matched to in the reference [H, W, 2] px (``x* + l_ji`` of the cross check).
         confidence: 0..1 [H, W].
     """
@@ -44,11 +46,14 @@ class Matcher(Protocol):
 
     name: str
 
-    def __call__(self, reference: UInt8, source: UInt8, guess: Float32 | None = None) -> Correspondence:
-        """Match two RGB or mono images of one size.
+    def __call__(
+        self, reference: UInt8, source: UInt8, guess: Float32 | None = None, *, coarse: bool = False
+    ) -> Correspondence:
+        """Match two RGB or mono images of one size; called for several sources at a time.
 
         Args:
             guess: expected target pixels [H, W, 2], from a geometry that is known by now; a matcher may ignore it.
+            coarse: half the resolution suffices; a matcher may ignore it.
         """
         ...
 
@@ -69,42 +74,72 @@ def load_matcher(name: str) -> Matcher:
     return made
 
 
+@dataclass(slots=True)
+class _Detected:
+    """Features of one image, found by whoever needs them first."""
+
+    image: UInt8
+    features: Features | None = None
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+
 class FlowMatcher:
     """Training-free: sparse matches seed a warp of the source, dense inverse search refines it."""
 
     name = "flow"
 
     def __init__(self) -> None:
-        self._features: dict[int, tuple[UInt8, Features]] = {}
+        self._detected: dict[int, _Detected] = {}
+        self._lock = threading.Lock()
 
-    def __call__(self, reference: UInt8, source: UInt8, guess: Float32 | None = None) -> Correspondence:
+    def __call__(
+        self, reference: UInt8, source: UInt8, guess: Float32 | None = None, *, coarse: bool = False
+    ) -> Correspondence:
         """Match by a warp of the source onto the reference, so that both directions share one frame."""
         first, second = grey(reference), grey(source)
         if guess is None:
             guess = seed_flow(first.shape, match_features(self._detect(reference, first), self._detect(source, second)))
-        grid = pixel_grid(first.shape)
-        if guess is None:
-            guess = grid
-        warped = sample(second, guess)
-        forward, backward = flow(first, warped), flow(warped, first)
-        inside = grid + forward  # in the warped source
-        target = sample(guess, inside)
-        back = inside + sample(backward, inside)
-        confidence = _similarity(first, sample(second, target)) * _texture(first)
-        height, width = first.shape
-        outside = (target < 0).any(axis=2) | (target[..., 0] > width) | (target[..., 1] > height)
-        target[outside] = np.nan
-        confidence[outside | np.isnan(confidence)] = 0.0
-        return Correspondence(target, back, confidence)
+        if not coarse:
+            return _refined(first, second, guess, fine=True)
+        half = _halved(first.shape)
+        scale = np.array([first.shape[1] / half[1], first.shape[0] / half[0]], np.float32)
+        small = [cv2.resize(image, half[::-1], interpolation=cv2.INTER_AREA) for image in (first, second)]
+        if guess is not None:
+            guess = cv2.resize(guess, half[::-1], interpolation=cv2.INTER_LINEAR) / scale
+        found = _refined(small[0], small[1], guess, fine=False)
+        return Correspondence(found.target * scale, found.back * scale, found.confidence)
 
     def _detect(self, image: UInt8, grey: UInt8) -> Features:
         """Features of an image; the reference comes again with every source."""
-        known = self._features.get(id(image))
-        if known is not None and known[0] is image:
-            return known[1]
-        found = detect(grey)
-        self._features = {**dict(list(self._features.items())[-15:]), id(image): (image, found)}
-        return found
+        with self._lock:
+            known = self._detected.get(id(image))
+            if known is None or known.image is not image:
+                known = _Detected(image)
+            self._detected = {**dict(list(self._detected.items())[-15:]), id(image): known}
+        with known.lock:
+            known.features = known.features or detect(grey)
+            return known.features
+
+
+def _halved(shape: tuple[int, ...]) -> tuple[int, int]:
+    return (shape[0] + 1) // 2, (shape[1] + 1) // 2
+
+
+def _refined(first: UInt8, second: UInt8, guess: Float32 | None, fine: bool) -> Correspondence:
+    """Dense correspondences of two grey images from where they are expected (None: in the same place)."""
+    grid = pixel_grid(first.shape)
+    guess = grid if guess is None else guess
+    warped = sample(second, guess)
+    forward, backward = flow(first, warped, fine), flow(warped, first, fine)
+    inside = grid + forward  # in the warped source
+    target = sample(guess, inside)
+    back = inside + sample(backward, inside)
+    confidence = _similarity(first, sample(second, target)) * _texture(first)
+    height, width = first.shape
+    outside = (target < 0).any(axis=2) | (target[..., 0] > width) | (target[..., 1] > height)
+    target[outside] = np.nan
+    confidence[outside | np.isnan(confidence)] = 0.0
+    return Correspondence(target, back, confidence)
 
 
 def pixel_grid(shape: tuple[int, ...]) -> Float32:
@@ -124,9 +159,14 @@ def grey(image: UInt8) -> UInt8:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
 
 
-def flow(first: UInt8, second: UInt8) -> Float32:
-    """Displacement [H, W, 2] px from the first image to the second."""
+def flow(first: UInt8, second: UInt8, fine: bool = False) -> Float32:
+    """Displacement [H, W, 2] px from the first image to the second; ``fine``: down to the full resolution."""
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    if fine:  # the preset ends at half of it; fewer steps a patch suffice there
+        search.setFinestScale(0)
+        search.setPatchStride(4)
+        search.setGradientDescentIterations(8)
+        search.setVariationalRefinementIterations(3)
     return np.asarray(search.calc(first, second, None), dtype=np.float32)
 
 

@@ -20,6 +20,7 @@ from sf_depth.core import checks, dense_ba, dense_depth, pinhole
 from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
 from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
 from sf_depth.core.outliers import lonely
+from sf_depth.core.parallel import each
 from sf_depth.core.scale import from_translations
 from sf_depth.core.start import Size, start, triangulate
 from sf_interfaces.errors import FormatError, InsufficientParallax
@@ -29,7 +30,7 @@ _LEAST_CONTRAST = 2.0  # grey levels; below it an image is blank
 _CHECK_ROUNDS = 2  # the checks and dense BA improve each other
 _NOISY_POSES = 1.5  # given poses that leave so many times the residual of free ones are refined
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
-_FIRST_STRIDE = 2  # the first round of matching only leads to the second: a quarter of its observations suffices
+_BLOCK = 1 << 15  # pixels solved at once: their arrays stay in the cache
 _LEAST_DENSITY = 0.01  # share of the reference's pixels that has to be triangulated
 
 
@@ -58,7 +59,10 @@ class Recovered:
 
 @dataclass(frozen=True, slots=True)
 class _Matched:
-    """Cross-checked correspondences: target [S, H, W, 2] px and weight [S, H, W]; ``seen`` is every n-th of them."""
+    """Cross-checked correspondences: target [S, H, W, 2] px and weight [S, H, W]; ``seen`` is every n-th of them.
+
+    A coarse match has half the rows and columns; its pixels are those of the full images.
+    """
 
     target: Float32
     weight: Float32
@@ -68,10 +72,11 @@ class _Matched:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """The optimum of dense BA and the observations that passed the checks on the way."""
+    """The optimum of dense BA, the observations that passed the checks, and how sure its scale is (relative)."""
 
     adjusted: Adjusted
     seen: Observations
+    scale_deviation: float = 0.0
 
 
 class MultiViewDepth:
@@ -110,8 +115,7 @@ class MultiViewDepth:
         theta = None if camera is None else pinhole.theta_of(camera)
         free = self._config.intrinsics if camera is None else "none"
 
-        last = self._config.rematches == 0
-        matched = self._match(reference, sources, stride=self._config.stride * (1 if last else _FIRST_STRIDE))
+        matched = self._match(reference, sources, coarse=self._config.rematches > 0)
         posed = theta is not None and T is not None
         at = _triangulated(matched.seen, theta, T) if theta is not None and T is not None else None
         fit = self._check_and_adjust(matched.seen, at or start(matched.seen, size, theta), size, not posed, free)
@@ -130,14 +134,20 @@ class MultiViewDepth:
         reference: UInt8,
         sources: Sequence[UInt8],
         guess: Sequence[Float32 | None] | None = None,
-        stride: int | None = None,
+        coarse: bool = False,
     ) -> _Matched:
         """Correspondences to every source that come back to where they started."""
-        guesses = guess if guess is not None else [None] * len(sources)
-        found = [self._matcher(reference, image, expected) for image, expected in zip(sources, guesses, strict=True)]
-        weight = np.stack([checks.cross_check(one) for one in found])
-        target = np.where(weight[..., None] > 0, np.stack([one.target for one in found]), np.float32(0))
-        return _Matched(target, weight, *_strided(target, weight, stride or self._config.stride))
+        size = Size(reference.shape[1], reference.shape[0])
+
+        def one(j: int) -> tuple[Float32, Float32]:
+            expected = None if guess is None else guess[j]
+            found = self._matcher(reference, sources[j], expected, coarse=coarse)
+            weight = checks.cross_check(found, size)
+            return np.where(weight[..., None] > 0, found.target, np.float32(0)), weight
+
+        found = each(one, range(len(sources)))
+        target, weight = (np.stack(part) for part in zip(*found, strict=True))
+        return _Matched(target, weight, *_strided(target, weight, self._config.stride, size))
 
     def _check_and_adjust(self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str) -> _Fit:
         """Dense BA over what passes the checks; both run again with the better geometry.
@@ -164,8 +174,8 @@ class MultiViewDepth:
         if fit.adjusted.sigma < _NOISY_POSES * free.adjusted.sigma:
             return fit
         at = free.adjusted.estimate
-        scaled = dense_ba.rescaled(at, from_translations(at.T[:, :3, 3], given.T[:, :3, 3]))
-        return _Fit(dense_ba.adjust(free.seen, scaled, poses=False), free.seen)
+        scale = from_translations(at.T[:, :3, 3], given.T[:, :3, 3])
+        return _Fit(dense_ba.rescaled(free.adjusted, scale.factor), free.seen, scale.deviation)
 
 
 def check_images(images: Sequence[UInt8]) -> None:
@@ -190,11 +200,11 @@ def _triangulated(seen: Observations, theta: Float64, T: Float64) -> Estimate:
     return Estimate(theta, T, triangulate(seen, Estimate(theta, T, np.ones(seen.uv.shape[1]))))
 
 
-def _strided(target: Float32, weight: Float32, stride: int) -> tuple[Observations, tuple[int, int]]:
+def _strided(target: Float32, weight: Float32, stride: int, size: Size) -> tuple[Observations, tuple[int, int]]:
     """Every n-th pixel of both axes as observations, and the size of that grid."""
     every = (slice(stride // 2, None, stride),) * 2
-    uv = pixel_grid(weight.shape[1:])[every]
-    count = len(weight)
+    count, height, width = weight.shape
+    uv = pixel_grid((height, width))[every] * np.array([size.width / width, size.height / height], np.float32)
     columns = target[:, every[0], every[1]].reshape(count, -1, 2).transpose(0, 2, 1).astype(np.float64)
     seen = Observations(
         np.ascontiguousarray(uv.reshape(-1, 2).T, dtype=np.float64),
@@ -241,16 +251,24 @@ def _filled(values: Float64, confidence: Float64) -> Float32:
 
 
 def _dense(matched: _Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
-    """Inverse depth of every pixel whose correspondences pass the checks."""
+    """Inverse depth [H, W] of every pixel whose correspondences pass the checks."""
     at, sigma = fit.adjusted.estimate, fit.adjusted.sigma
-    uv = pixel_grid((size.height, size.width)).reshape(-1, 2).T.astype(np.float64)
-    flat = matched.weight.reshape(len(at.T), -1)
-    targets = matched.target.reshape(len(at.T), -1, 2).transpose(0, 2, 1)
-    weight = checks.checked(flat, uv, targets, at, size.width).reshape(matched.weight.shape)
-    solved = dense_depth.solve(at, matched.target, weight, sigma)
+    grid = pixel_grid((size.height, size.width)).reshape(-1, 2)
+    weight, target = matched.weight.reshape(len(at.T), -1), matched.target.reshape(len(at.T), -1, 2)
+
+    def solved(index: np.ndarray) -> dense_depth.InverseDepth:
+        uv, to = np.ascontiguousarray(grid[index].T), np.ascontiguousarray(target[:, index].transpose(0, 2, 1))
+        trusted = checks.checked(weight[:, index], uv, to, at, size.width)
+        return dense_depth.solve(at, uv, to, trusted, sigma, size.width)
+
+    seen = np.flatnonzero(weight.any(axis=0))
+    parts = each(solved, np.array_split(seen, max(1, len(seen) // _BLOCK)))
+    d, variance, support = (np.full(len(grid), empty, np.float32) for empty in (np.nan, np.nan, 0.0))
+    for name, image in (("d", d), ("variance", variance), ("support", support)):
+        image[seen] = np.concatenate([getattr(part, name) for part in parts])
+    d, variance, support = (image.reshape(size.height, size.width) for image in (d, variance, support))
     common = dense_depth.common_variance(fit.adjusted, fit.seen, matched.grid, (size.height, size.width))
-    d = np.where(lonely(solved.d), np.float32(np.nan), solved.d)
-    return dense_depth.InverseDepth(d, solved.variance + common, solved.support)
+    return dense_depth.InverseDepth(np.where(lonely(d, variance), np.float32(np.nan), d), variance + common, support)
 
 
 def registered(seen: Observations) -> np.ndarray:
@@ -274,7 +292,7 @@ def _recovered(
         raise InsufficientParallax(
             f"only {density:.1%} of the pixels can be triangulated; give views with more parallax and more overlap"
         )
-    variance = np.where(np.isfinite(z), z**4 * solved.variance, np.nan)
+    variance = np.where(np.isfinite(z), z**4 * solved.variance + (z * fit.scale_deviation) ** 2, np.nan)
     own = camera or pinhole.camera_of(at.theta, size.width, size.height)
     focal_sigma = 0.0 if camera is not None else dense_depth.focal_deviation(adjusted)
     return Recovered(

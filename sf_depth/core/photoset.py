@@ -17,7 +17,7 @@ from sf_depth.config import DepthConfig
 from sf_depth.core.filling import Filler
 from sf_depth.core.matching import grey
 from sf_depth.core.mvd import MultiViewDepth, Recovered, check_images
-from sf_depth.core.scale import from_translations
+from sf_depth.core.scale import GlobalScale, from_translations, in_unit
 from sf_depth.core.seeds import Features, detect, match_features
 from sf_interfaces.errors import FormatError, InsufficientParallax
 from sf_interfaces.geometry import se3
@@ -189,7 +189,7 @@ class _Work:
         if self._given is not None:
             T = np.stack([se3.inverse(self._poses[j]) @ self._poses[reference] for j in sources])
         got = self._parts.recover(self._images, reference, sources, self._camera, T)
-        scale = 1.0
+        scale = GlobalScale(1.0, 0.0)
         if first:
             self._first, self._camera = got, got.camera
             self._poses.setdefault(reference, np.eye(4))
@@ -198,11 +198,9 @@ class _Work:
         for k, j in enumerate(sources):
             if j not in self._poses and got.registered[k]:
                 step = got.T_source_reference[k].copy()
-                step[:3, 3] *= scale
+                step[:3, 3] *= scale.factor
                 self._poses[j] = self._poses[reference] @ se3.inverse(step)
-        variance = got.depth.variance
-        assert variance is not None
-        self._depth[reference] = DepthMap(got.depth.z * scale, variance * scale**2, got.depth.scale)
+        self._depth[reference] = in_unit(got.depth, scale)
 
     def _sources(self, reference: int, limit: int) -> list[int]:
         """The images that overlap best; at least two of them placed already, so that the scale is known."""
@@ -211,7 +209,7 @@ class _Work:
         anchors = [j for j in order if j in self._poses][:2]
         return anchors + [j for j in order if j not in anchors][: max(limit - len(anchors), 0)]
 
-    def _scale(self, reference: int, sources: list[int], got: Recovered) -> float:
+    def _scale(self, reference: int, sources: list[int], got: Recovered) -> GlobalScale:
         known = [k for k, j in enumerate(sources) if j in self._poses and got.registered[k]]
         true = [(se3.inverse(self._poses[sources[k]]) @ self._poses[reference])[:3, 3] for k in known]
         return from_translations(got.T_source_reference[known, :3, 3], np.array(true).reshape(-1, 3))

@@ -58,7 +58,8 @@ def moved(theta: Float64, columns: Float64, step: Float64) -> Float64:
 
 
 def rays(theta: Float64, uv: Float64) -> Float64:
-    """Undistorted normalised coordinates [2, N] of pixels [2, N]."""
+    """Undistorted normalised coordinates [2, N] of pixels [2, N], in their precision."""
+    theta = theta.astype(uv.dtype, copy=False)
     x = (uv - theta[2:4, None]) / theta[:2, None]
     k1 = theta[4]
     if k1 == 0.0:
@@ -72,10 +73,11 @@ def rays(theta: Float64, uv: Float64) -> Float64:
 
 def rays_jacobian(theta: Float64, x: Float64, columns: Float64) -> Float64:
     """d x / d phi [2, K, N] at fixed pixels, for undistorted coordinates x [2, N]."""
+    theta, columns = theta.astype(x.dtype, copy=False), columns.astype(x.dtype, copy=False)
     r2 = (x * x).sum(axis=0)
     distorted = x * (1.0 + theta[4] * r2)
     # The distorted point moves by -(x_d * df/f + dc/f) and -x r^2 dk1; D carries it back to the undistorted one.
-    shift = np.empty((2, columns.shape[1], x.shape[1]))
+    shift = np.empty((2, columns.shape[1], x.shape[1]), x.dtype)
     for axis in range(2):
         f = theta[axis]
         shift[axis] = -(np.outer(columns[axis], distorted[axis]) + columns[2 + axis][:, None]) / f

@@ -7,14 +7,26 @@ or one wrong pose does not move it. Every threshold is relative, so there is no 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sf_interfaces.errors import InsufficientParallax
-from sf_interfaces.types import Camera, Float32, Float64
+from sf_interfaces.types import Camera, DepthMap, Float32, Float64
 
 _TOLERANCE = 0.05  # relative difference of an inlier
 _LEAST_LANDMARKS = 8
+_MAD = 1.4826 * 1.2533  # from a median deviation to the deviation of a median, times the root of the count
+_CHI2_MEDIAN = 2.366  # of three degrees of freedom: a squared length per component
 _LEAST_SHARE = 0.3  # of the landmarks that have to agree
+
+
+@dataclass(frozen=True, slots=True)
+class GlobalScale:
+    """Factor from the own unit to the global one, and its relative deviation: what the references disagree on."""
+
+    factor: float
+    deviation: float
 
 
 def consensus(ratios: Float64) -> tuple[float, np.ndarray]:
@@ -25,8 +37,8 @@ def consensus(ratios: Float64) -> tuple[float, np.ndarray]:
     return float(np.exp(np.median(logs[near[best]]))), near[best]
 
 
-def from_landmarks(z: Float32, landmarks: Float64, camera: Camera) -> float:
-    """Factor that brings depth z [H, W] to the unit of landmarks [N, 3] in the optical frame.
+def from_landmarks(z: Float32, landmarks: Float64, camera: Camera) -> GlobalScale:
+    """What brings depth z [H, W] to the unit of landmarks [N, 3] in the optical frame.
 
     Raises:
         InsufficientParallax: too few landmarks fall on estimated depth, or they do not agree.
@@ -47,11 +59,12 @@ def from_landmarks(z: Float32, landmarks: Float64, camera: Camera) -> float:
         raise InsufficientParallax(
             f"{inlier.mean():.0%} of {len(ratios)} landmarks agree on a scale, {_LEAST_SHARE:.0%} are needed"
         )
-    return scale
+    spread = _MAD * float(np.median(np.abs(np.log(ratios / scale))))  # wrong landmarks hardly count
+    return GlobalScale(scale, spread / np.sqrt(len(ratios)))
 
 
-def from_translations(estimated: Float64, given: Float64) -> float:
-    """Factor that brings estimated translations [S, 3] to given ones; those without motion do not count.
+def from_translations(estimated: Float64, given: Float64) -> GlobalScale:
+    """What brings estimated translations [S, 3] to given ones; those without motion do not count.
 
     Raises:
         InsufficientParallax: no translation to compare.
@@ -60,5 +73,18 @@ def from_translations(estimated: Float64, given: Float64) -> float:
     moving = (own > 1e-9) & (true > 0.1 * true.max(initial=0.0)) & (true > 0)
     if not moving.any():
         raise InsufficientParallax("the given poses have no baseline, so the scale of the depth stays unknown")
-    scale, _ = consensus(true[moving] / own[moving])
-    return scale
+    ratios = true[moving] / own[moving]
+    scale, _ = consensus(ratios)
+    # What directions and lengths leave says how good the translations are. The errors of one source of poses are
+    # alike, so their number does not make the scale surer.
+    left = np.linalg.norm(scale * estimated[moving] - given[moving], axis=1) / true[moving]
+    deviation = float(np.sqrt(np.median(left**2) / _CHI2_MEDIAN))
+    return GlobalScale(scale, max(deviation, _TOLERANCE) if len(ratios) == 1 else deviation)
+
+
+def in_unit(depth: DepthMap, scale: GlobalScale) -> DepthMap:
+    """Depth with variance in the global unit."""
+    assert depth.variance is not None
+    z = depth.z * np.float32(scale.factor)
+    variance = depth.variance * np.float32(scale.factor**2) + (z * np.float32(scale.deviation)) ** 2
+    return DepthMap(z, variance, depth.scale)

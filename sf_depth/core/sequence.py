@@ -18,7 +18,7 @@ from sf_depth.core.filling import Filler
 from sf_depth.core.mvd import MultiViewDepth
 from sf_depth.core.neighbors import NeighborLimits, before_and_after
 from sf_depth.core.overlap import sighted_depth
-from sf_depth.core.scale import from_landmarks, from_translations
+from sf_depth.core.scale import GlobalScale, from_landmarks, in_unit
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Float64, Keyframe
@@ -94,9 +94,8 @@ class PosedSetting:
 
     def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> DepthMap:
         """Depth with the given poses; where they fit the images badly, their translations only give the scale."""
-        T = _relative(frame, sources)
-        got = mvd.recover(frame.image, [s.image for s in sources], frame.camera, T)
-        return scaled(got.depth, from_translations(got.T_source_reference[:, :3, 3], T[:, :3, 3]), frame)
+        got = mvd.recover(frame.image, [s.image for s in sources], frame.camera, _relative(frame, sources))
+        return scaled(got.depth, GlobalScale(1.0, 0.0), frame)
 
 
 class EachDepth:
@@ -118,10 +117,10 @@ class EachDepth:
         return []
 
 
-def scaled(depth: DepthMap, scale: float, frame: Keyframe) -> DepthMap:
-    """Depth in the unit of the keyframe's pose."""
-    assert depth.variance is not None
-    return DepthMap(depth.z * scale, depth.variance * scale**2, frame.depth.scale if frame.depth else depth.scale)
+def scaled(depth: DepthMap, scale: GlobalScale, frame: Keyframe) -> DepthMap:
+    """Depth in the unit of the keyframe's pose; what is not sure about its scale is in the variance."""
+    own = in_unit(depth, scale)
+    return replace(own, scale=frame.depth.scale) if frame.depth else own
 
 
 class SequenceDepth:

@@ -80,7 +80,7 @@ def _refined(seen: Observations, at: Estimate, intrinsics: str) -> dense_ba.Adju
 
 def _canonical(at: Estimate) -> Estimate:
     """The unit of length in which the median depth is one."""
-    return dense_ba.rescaled(at, float(np.median(at.inverse_depth)))
+    return dense_ba.in_unit(at, float(np.median(at.inverse_depth)))
 
 
 def _require_parallax(seen: Observations, size: Size, theta: Float64 | None) -> None:
