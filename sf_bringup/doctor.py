@@ -130,6 +130,7 @@ def checks(seconds: float = 3.0) -> list[Check]:
         _import("sf_interfaces.msg"),
         _import("tf2_msgs.msg"),
         _import("sf_recon._native"),
+        _import("sf_tracking._native"),
         _torch,
         _blocks,
         _models,

@@ -20,9 +20,9 @@ setup(
         *((f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*"))) for folder in ("launch", "config", "rviz")),
     ],
     entry_points={
-        # sf_recon is an ament_cmake package, which declares no entry points of its own.
-        "scenefactory.blocks": ["recon = sf_recon.block:SPEC"],
-        "scenefactory.parts": ["recon = sf_recon.block:make"],
+        # sf_recon and sf_tracking are ament_cmake packages, which declare no entry points of their own.
+        "scenefactory.blocks": ["recon = sf_recon.block:SPEC", "tracking = sf_tracking.block:SPEC"],
+        "scenefactory.parts": ["recon = sf_recon.block:make", "tracking = sf_tracking.block:make"],
         "console_scripts": ["sf = sf_bringup.cli:main"],
     },
 )

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import sysconfig
+from importlib import import_module
 from importlib.metadata import distribution, entry_points
 from pathlib import Path
 
@@ -88,9 +89,9 @@ def test_generated_modules_sit_beside_the_vocabulary() -> None:
 
 
 @needs_install
-def test_the_extension_is_compiled() -> None:
-    import sf_recon._native as native
-
+@pytest.mark.parametrize("block", ["sf_recon", "sf_tracking"])
+def test_the_extension_is_compiled(block: str) -> None:
+    native = import_module(f"{block}._native")
     assert native.__file__ is not None and native.__file__.endswith(".so")
 
 

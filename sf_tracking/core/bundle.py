@@ -3,6 +3,7 @@
 A patch is a ray (x, y, 1) of its keyframe with inverse depth w. In another camera it lies at
 ``R (x, y, 1) + w t``: nothing is divided by w, so a patch may move to infinity. Inverse depths are
 eliminated by their Schur complement; those with a measured depth carry it as a prior, the others are free.
+The sums are compiled; :mod:`.bundle_reference` is the same in numpy.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -15,11 +16,11 @@ from numpy.typing import NDArray
 
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64
+from sf_tracking.core.native import intrinsics, native
 
-_MIN_Z = 0.05  # of the unit ray; a patch nearer to the target's image plane or behind it carries no information
+MIN_Z = 0.05  # of the unit ray; a patch nearer to the target's image plane or behind it carries no information
 _DAMPING = 1e-4  # first Levenberg-Marquardt damping, relative to the diagonal
 _MAX_DAMPING = 1e4
-_SERIAL = 200_000  # multiplications below which matrix products run on one thread
 _FLOOR = 1e-9  # of a diagonal: a pose or a depth without any observation stays where it is
 
 
@@ -39,50 +40,23 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True)
-class _Linear:
-    """The problem linearised: H, b of the poses, C, c of the inverse depths, E their coupling; the cost."""
+class Linear:
+    """The problem linearised: H, b of the poses, C, c of the inverse depths, E their coupling."""
 
     H: Float64  # [6N, 6N]
     b: Float64  # [6N]
     C: Float64  # [N, M]
     c: Float64  # [N, M]
-    E: Float64  # [N, N, 6, M] keyframe of the patch, pose, pose coordinate, patch
+    E: Float64  # [6N, N M]
 
 
 def project(camera: Camera, T_ts: Float64, rays: Float64, w: Float64) -> tuple[Float64, Float64]:
     """Continuous px [..., M, 2] and scaled points [..., M, 3] of rays [..., M, 2] moved by T_ts [..., 4, 4]."""
     R = np.swapaxes(T_ts[..., :3, :3], -1, -2)
     X = rays @ R[..., :2, :] + R[..., 2:, :] + w[..., None] * T_ts[..., None, :3, 3]
-    z = np.where(X[..., 2] > _MIN_Z, X[..., 2], np.nan)
+    z = np.where(X[..., 2] > MIN_Z, X[..., 2], np.nan)
     uv = X[..., :2] / z[..., None] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return uv, X
-
-
-def jacobians(camera: Camera, X: Float64, w: Float64, t: Float64, root: Float64) -> tuple[Float64, Float64]:
-    """Whitened derivatives of the projection at scaled points X [..., M, 3] with inverse depth w [..., M].
-
-    Args:
-        t: [..., 3] translation of the motion that brought the points here, m.
-        root: [..., M, 3] (a, b, c) of ``[[a, b], [0, c]]``, a root of the information: r -> (a r_u + b r_v, c r_v).
-
-    Returns:
-        d(whitened uv)/d(xi) [..., 6, 2, M] for exp(xi) T_cw, and d(whitened uv)/dw [..., 2, M].
-    """
-    iz = 1.0 / X[..., 2]
-    x, y, d = X[..., 0] * iz, X[..., 1] * iz, w * iz
-    along_u = (t[..., 0, None] - t[..., 2, None] * x) * iz
-    along_v = (t[..., 1, None] - t[..., 2, None] * y) * iz
-    J = np.empty((*w.shape[:-1], 6, 2, w.shape[-1]))
-    J_w = np.empty((*w.shape[:-1], 2, w.shape[-1]))
-    rows = ((camera.fx * root[..., 0], camera.fy * root[..., 1]), (np.zeros_like(w), camera.fy * root[..., 2]))
-    for row, (a, b) in enumerate(rows):
-        J[..., 0, row, :], J[..., 1, row, :] = a * d, b * d
-        J[..., 2, row, :] = -d * (a * x + b * y)
-        J[..., 3, row, :] = -a * x * y - b * (1 + y * y)
-        J[..., 4, row, :] = a * (1 + x * x) + b * x * y
-        J[..., 5, row, :] = b * x - a * y
-        J_w[..., row, :] = a * along_u + b * along_v
-    return J, J_w
 
 
 def information_root(information: Float64) -> Float64:
@@ -93,100 +67,49 @@ def information_root(information: Float64) -> Float64:
     return np.stack([a, b, c], axis=-1)
 
 
-def whiten(r: Float64, root: Float64) -> Float64:
-    """Residuals [..., M, 2] px in standard deviations, [..., 2, M]."""
-    u = root[..., 0] * r[..., 0] + root[..., 1] * r[..., 1]
-    return np.stack([u, root[..., 2] * r[..., 1]], axis=-2)
+def motions(p: Problem) -> Float64:
+    """T_ts [N, N, 4, 4] from every keyframe, the first index, to every other."""
+    return np.asarray(p.T_cw[None] @ se3.inverse(p.T_cw)[:, None])
 
 
-def robust(squared: Float64, scale: float) -> tuple[Float64, Float64]:
-    """Cauchy weight and cost of squared Mahalanobis errors; ``scale`` in standard deviations."""
-    relative = squared / scale**2
-    return 1.0 / (1.0 + relative), scale**2 * np.log1p(relative)
-
-
-def _residuals(camera: Camera, p: Problem) -> tuple[Float64, Float64, Float64]:
-    """Whitened r [N, N, 2, M] (0 where nothing is seen), scaled points [N, N, M, 3] and T_ts [N, N, 4, 4]."""
-    T_ts = p.T_cw[None] @ se3.inverse(p.T_cw)[:, None]
-    uv, X = project(camera, T_ts, p.rays[:, None], p.w[:, None])
-    valid = (X[..., 2] > _MIN_Z)[..., None]
-    return whiten(np.where(valid, p.uv - uv, 0.0), p.root), np.where(valid, X, (0.0, 0.0, 1.0)), T_ts
-
-
-def cost(camera: Camera, p: Problem, scale: float) -> float:
-    """Robust cost of all observations and priors."""
-    squared = (_residuals(camera, p)[0] ** 2).sum(axis=2)
-    depth = p.prior_weight * (p.prior - p.w) ** 2
-    moved = np.einsum("sti,stij,stj->", *_motion_error(p, p.T_cw[None] @ se3.inverse(p.T_cw)[:, None]))
-    return float(robust(squared, scale)[1].sum() + robust(depth, scale)[1].sum() + moved)
-
-
-def _motion_error(p: Problem, T_ts: Float64) -> tuple[Float64, Float64, Float64]:
-    """log(T_ts motion^-1) [N, N, 6] where a motion was measured, its information, and the error again."""
+def motion_error(p: Problem, T_ts: Float64) -> tuple[Float64, Float64]:
+    """log(T_ts motion^-1) [N, N, 6], 0 where no motion was measured, and its information times that."""
     e = np.zeros((*T_ts.shape[:2], 6))
     known = p.motion_information.any(axis=(2, 3))
     if known.any():
         e[known] = se3.log(T_ts[known] @ se3.inverse(p.motion[known]))
-    return e, p.motion_information, e
+    return e, (p.motion_information @ e[..., None])[..., 0]
 
 
-def _linearise(camera: Camera, p: Problem, scale: float) -> _Linear:
-    n, m = p.w.shape
-    r, X, T_ts = _residuals(camera, p)
-    weight = np.sqrt(robust((r**2).sum(axis=2), scale)[0])  # [N, N, M]
-    w = np.broadcast_to(p.w[:, None], weight.shape)
-    J, J_w = jacobians(camera, X, w, T_ts[..., :3, 3], p.root * weight[..., None])
-    r = r * weight[:, :, None]
-    couple = (J * J_w[:, :, None]).sum(axis=3)  # [N, N, 6, M]
-    J = J.reshape(n, n, 6, 2 * m)
-    own = J @ J.transpose(0, 1, 3, 2)  # [N, N, 6, 6] of the target's pose, for each pair
-    g = (J @ r.reshape(n, n, 2 * m, 1))[..., 0]  # [N, N, 6]
-    e, motion_information, _ = _motion_error(p, T_ts)
-    own += motion_information
-    g -= (motion_information @ e[..., None])[..., 0]
-    # The source's Jacobian is that of the target times -Ad(T_ts): its blocks follow from the pair's own.
-    A = -se3.adjoint(T_ts)
-    At = A.transpose(0, 1, 3, 2)
-    H = np.zeros((n, n, 6, 6))
-    diagonal = np.arange(n)
-    H[diagonal, diagonal] = own.sum(axis=0) + (At @ own @ A).sum(axis=1)
-    cross = own @ A  # target rows, source columns
-    H += cross.transpose(1, 0, 2, 3) + cross.transpose(0, 1, 3, 2)
-    b = g.sum(axis=0) + (At @ g[..., None])[..., 0].sum(axis=1)
-    E = couple.copy()
-    E[diagonal, diagonal] += (At @ couple).sum(axis=1)
-    on_prior = p.prior_weight * robust(p.prior_weight * (p.prior - p.w) ** 2, scale)[0]
-    C = (J_w**2).sum(axis=(1, 2)) + on_prior
-    c = (J_w * r).sum(axis=(1, 2)) + on_prior * (p.prior - p.w)
-    return _Linear(H.transpose(0, 2, 1, 3).reshape(6 * n, 6 * n), b.reshape(-1), C, c, E)
+def _arrays(p: Problem, T_ts: Float64) -> tuple[Float64, ...]:
+    return T_ts, p.rays, p.w, p.prior, p.prior_weight, p.uv, p.root
 
 
-def _outer(a: Float64, b: Float64) -> Float64:
-    """``a @ b.T`` of wide matrices [K, L] in blocks so small that no library splits them among threads.
-
-    The sum is then the same for any number of threads, and nothing waits for busy cores.
-    """
-    rows, columns = a.shape
-    width = max(1, _SERIAL // rows**2)
-    blocks = -(-columns // width)
-    padded = np.zeros((2, rows, blocks * width))
-    padded[0, :, :columns], padded[1, :, :columns] = a, b
-    x, y = padded.reshape(2, rows, blocks, width).transpose(0, 2, 1, 3)
-    return np.asarray((x @ y.transpose(0, 2, 1)).sum(axis=0))
+def cost(camera: Camera, p: Problem, scale: float) -> float:
+    """Robust cost of all observations, priors and measured motions."""
+    T_ts = motions(p)
+    e, pull = motion_error(p, T_ts)
+    return float(native().bundle_cost(intrinsics(camera), scale, *_arrays(p, T_ts)) + (e * pull).sum())
 
 
-def _step(linear: _Linear, free: NDArray[np.bool_], damping: float) -> tuple[Float64, Float64]:
+def linearise(camera: Camera, p: Problem, scale: float) -> Linear:
+    """The normal equations at the present poses and inverse depths."""
+    T_ts = motions(p)
+    pull = motion_error(p, T_ts)[1]
+    found = native().linearise(intrinsics(camera), scale, p.motion_information, pull, *_arrays(p, T_ts))
+    return Linear(*found)
+
+
+def _step(linear: Linear, free: NDArray[np.bool_], damping: float) -> tuple[Float64, Float64]:
     """Pose steps [N, 6] (0 where fixed) and inverse depth steps [N, M] of the damped normal equations."""
     n = len(free)
-    C = linear.C * (1 + damping) + _FLOOR
-    E = linear.E.transpose(1, 2, 0, 3).reshape(6 * n, -1)
-    over = E / C.reshape(-1)
-    S = linear.H + np.diag(damping * np.diag(linear.H) + _FLOOR) - _outer(over, E)
-    b = linear.b - over @ linear.c.reshape(-1)
+    C = (linear.C * (1 + damping) + _FLOOR).reshape(-1)
+    H = linear.H + np.diag(damping * np.diag(linear.H) + _FLOOR)
+    S, b = native().eliminate(linear.E, C, linear.c.reshape(-1), H, linear.b)
     on = np.repeat(free, 6)
     xi = np.zeros(6 * n)
     xi[on] = np.linalg.solve(S[np.ix_(on, on)], b[on])
-    dw = (linear.c.reshape(-1) - xi @ E) / C.reshape(-1)
+    dw = (linear.c.reshape(-1) - xi @ linear.E) / C
     return xi.reshape(n, 6), dw.reshape(linear.C.shape)
 
 
@@ -205,10 +128,10 @@ def adjust(
         last linearisation.
     """
     damping, now = _DAMPING, cost(camera, p, scale)
-    linear, stale = _linearise(camera, p, scale), False
+    linear, stale = linearise(camera, p, scale), False
     for _ in range(iterations):
         if stale:
-            linear, stale = _linearise(camera, p, scale), False
+            linear, stale = linearise(camera, p, scale), False
         xi, dw = _step(linear, free, damping)
         # Poses are products of products: without this their rotations drift from orthonormal frame by frame.
         T_cw = np.where(free[:, None, None], se3.orthonormalise(se3.exp(xi) @ p.T_cw), p.T_cw)

@@ -14,7 +14,8 @@ from sf_interfaces.types import Camera, Float64, Frame, Scale
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.bundle import project
 from sf_tracking.core.keyframes import TrackedKeyframe
-from sf_tracking.core.locate import Locator, solve_pose
+from sf_tracking.core.locate import Locator
+from sf_tracking.core.pose import solve_pose
 from sf_tracking.core.update import View, search
 from sf_tracking.core.window import Window
 

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, Float64
+from sf_interfaces.types import Float64
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import information_root, jacobians, robust, whiten
 from sf_tracking.core.keyframes import Reprojection, TrackedKeyframe, reproject
+from sf_tracking.core.pose import Solution, solve_pose
 from sf_tracking.core.search import consensus
 from sf_tracking.core.update import UpdateOperator, View, search
 
@@ -25,12 +25,7 @@ _MOST = 0.5  # share of them that must agree on a pose far from the predicted on
 _CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
 _MOTION = np.diag([0.03**-2] * 3 + [0.02**-2] * 3)  # information of a predicted pose, m and rad
 _HONEST, _PLENTY = 1.5, 80  # excess of errors and number of patches, from which patches alone are trusted
-_STILL = 1e-6  # step of the pose, m and rad, that ends the iterations
-_MEDIAN_CHI2 = 1.386  # of two degrees of freedom
-_STEPS = 6  # at most, per robust scale
-_BEHIND = 1e-3  # of the unit ray, up to which a point counts as behind the camera
 _FAR = 1e-6  # inverse depth, 1/m, below which a point counts as that far
-_PRIOR = np.diag([1e2] * 3 + [1e3] * 3)  # information that the prediction adds where patches see nothing
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,66 +84,6 @@ def join(parts: Sequence[Sights]) -> Sights:
     none = Sights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
     parts = parts or [none]
     return Sights(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("keyframe", "patch", "uv", "information")))
-
-
-@dataclass(frozen=True, slots=True)
-class Solution:
-    """A pose and how well its patches agree with it."""
-
-    T_cw: Float64
-    error: Float64  # [E] px, reprojection errors
-    information: Float64  # [6, 6] of exp(xi) T_cw
-    excess: float  # squared errors relative to what their standard deviations say, at least 1
-    support: float  # how many patches agree within what alignment claims: the sum of robust weights
-
-
-def solve_pose(
-    camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64, information: Float64, scales: Sequence[float]
-) -> Solution:
-    """Robust pose of a camera from patches in the world, near ``T_cw``; Gauss-Newton.
-
-    Args:
-        X: [E, 3] scaled points, world position times inverse depth ``w`` [E].
-        uv, information: [E, 2] px and [E, 2, 2] where they were seen.
-        scales: where the robust kernel sets in, standard deviations; narrower from one to the next.
-    """
-    claimed, excess, support = information_root(information), 1.0, 0.0
-    away, H = np.zeros(6), np.zeros((6, 6))
-    for scale in scales:
-        # Errors beyond what alignment claims (rolling shutter, depth registered badly) widen the kernel.
-        root = claimed / np.sqrt(excess)
-        for _ in range(_STEPS):
-            r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
-            white = whiten(r, root)  # [2, E]
-            weight = np.sqrt(robust((white**2).sum(axis=0), scale)[0])
-            J, _ = jacobians(camera, Xc, w, np.zeros(3), root * weight[:, None])
-            J = J.reshape(6, -1)
-            H = J @ J.T
-            step = np.linalg.solve(H + _PRIOR, J @ (white * weight).ravel() - _PRIOR @ away)
-            T_cw, away = se3.exp(step) @ T_cw, away + step
-            if np.abs(step).max() < _STILL:
-                break
-        r, Xc = _reprojection_error(camera, T_cw, X, w, uv)
-        white = whiten(r, claimed)
-        excess, support = _excess(white), float(robust((white**2).sum(axis=0), scale)[0].sum())
-    error = np.where(Xc[:, 2] > _BEHIND, np.linalg.norm(r, axis=1), np.inf)
-    return Solution(se3.orthonormalise(T_cw), error, H, excess, support)
-
-
-def _excess(white: Float64) -> float:
-    """How much larger squared errors [2, E] are than their standard deviations say, at least 1."""
-    if white.shape[1] == 0:
-        return 1.0
-    return max(1.0, float(np.median((white**2).sum(axis=0))) / _MEDIAN_CHI2)
-
-
-def _reprojection_error(camera: Camera, T_cw: Float64, X: Float64, w: Float64, uv: Float64) -> tuple[Float64, Float64]:
-    """Residual [E, 2] px, 0 for patches behind the camera, and their scaled points [E, 3]."""
-    Xc = X @ T_cw[:3, :3].T + w[:, None] * T_cw[:3, 3]
-    behind = Xc[:, 2:] <= _BEHIND
-    Xc = np.where(behind, (0.0, 0.0, _BEHIND), Xc)
-    projected = Xc[:, :2] / Xc[:, 2:] * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    return np.where(behind, 0.0, uv - projected), Xc
 
 
 class Locator:

@@ -1,6 +1,7 @@
 """Alignment of measured depth: point-to-plane, from one view's surface to another's.
 
-It sees what patches do not: bare walls, and the geometry between textured places.
+It sees what patches do not: bare walls, and the geometry between textured places. The loops over pixels and points are
+compiled; :mod:`.shape_reference` is the same in numpy.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, Float64, Frame
+from sf_interfaces.types import Camera, Float32, Float64, Frame
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import robust
+from sf_tracking.core.native import dense, intrinsics, native
 
 _COLUMNS = 80  # of the grid on which dense depth is compared
 _EDGE = 0.05  # relative step of depth between cells, beyond which they belong to different surfaces
@@ -25,6 +26,7 @@ _POINTS = 1500  # sparse points compared at most
 _SCALE = 2.0  # of the robust kernel, standard deviations
 _MIN_POINTS = 60
 _FIRST_REACH, _REACH = 0.10, 0.03  # relative to depth: how far apart surfaces may lie, at first and at last
+_SLACK = 0.02  # added to both
 _STEPS = 5
 _STILL = 1e-5
 
@@ -62,7 +64,7 @@ def shape_of(frame: Frame, config: TrackingConfig) -> Shape | None:
         return _scattered(points, config.lidar_sigma)
     if frame.depth is None:
         return None
-    return _gridded(camera, np.where(frame.depth.valid, frame.depth.z, 0.0), config.depth_sigma)
+    return _gridded(camera, frame.depth.z, config.depth_sigma)
 
 
 def _scattered(points: Float64, sigma: float) -> Shape:
@@ -74,16 +76,11 @@ def _scattered(points: Float64, sigma: float) -> Shape:
     return Shape(points, np.where(flat[:, None], vectors[:, :, 0], np.nan), None, tree, np.full(len(points), sigma))
 
 
-def _gridded(camera: Camera, z: Float64, sigma: float) -> Shape:
+def _gridded(camera: Camera, z: Float32, sigma: float) -> Shape:
     step = max(1, round(camera.width / _COLUMNS))
-    h, w = camera.height // step, camera.width // step
-    block = z[: h * step, : w * step].reshape(h, step, w, step).astype(np.float64)
-    known = block > 0
-    count = known.sum(axis=(1, 3))
-    mean = block.sum(axis=(1, 3)) / np.maximum(count, 1)
-    extent = block.max(axis=(1, 3)) - np.where(known, block, np.inf).min(axis=(1, 3))
-    with np.errstate(invalid="ignore"):
-        good = (count > 0.6 * step * step) & (extent < _EDGE * step / 4 * mean)
+    known, mean, extent = native().thin(np.ascontiguousarray(z, np.float32), step)
+    h, w = mean.shape
+    good = (known > 0.6 * step * step) & (extent < _EDGE * step / 4 * mean)
     v, u = (np.mgrid[0:h, 0:w] + 0.5) * step
     vertices = camera.unproject(np.stack([u, v], axis=-1), np.where(good, mean, np.nan))  # [h, w, 3]
     across, down = np.full_like(vertices, np.nan), np.full_like(vertices, np.nan)
@@ -104,11 +101,8 @@ def _partners(camera: Camera, target: Shape, moved: Float64) -> NDArray[np.int64
         return np.asarray(target.tree.query(moved)[1])
     assert target.grid is not None
     h, w = target.grid.shape
-    uv, z = camera.project(moved)
-    with np.errstate(invalid="ignore"):
-        cell = np.floor(np.nan_to_num(uv) * (w / camera.width, h / camera.height)).astype(np.int64)
-    inside = (cell >= 0).all(axis=1) & (cell < (w, h)).all(axis=1) & (z > 0)
-    return np.where(inside, target.grid[np.clip(cell[:, 1], 0, h - 1), np.clip(cell[:, 0], 0, w - 1)], -1)
+    found = native().partners(intrinsics(camera), dense(moved), target.grid, w / camera.width, h / camera.height)
+    return np.asarray(found)
 
 
 def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64, trust: float) -> ShapeFit | None:
@@ -122,18 +116,14 @@ def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64
     for step_index in range(_STEPS):
         moved = se3.transform(T, source.points)
         partner = _partners(camera, target, moved)
-        n, p = target.normals[partner], target.points[partner]
-        r = ((p - moved) * n).sum(axis=1)
-        reach = (_FIRST_REACH if step_index == 0 else _REACH) * moved[:, 2]
-        good = (partner >= 0) & np.isfinite(r) & (np.linalg.norm(p - moved, axis=1) < reach + 0.02 * moved[:, 2])
-        if good.sum() < _MIN_POINTS:
+        reach = (_FIRST_REACH if step_index == 0 else _REACH) + _SLACK
+        H, g, used = native().plane_system(
+            dense(moved), source.sigma, partner, target.points, target.normals, reach, _SCALE, trust
+        )
+        if used < _MIN_POINTS:
             return None
-        n, r, moved, share = n[good], r[good], moved[good], float(good.mean())
-        deviation = np.maximum(source.sigma[good], 1.4826 * np.median(np.abs(r)))
-        weight = robust((r / deviation) ** 2, _SCALE)[0] / deviation**2 * trust
-        J = np.concatenate([n, np.cross(moved, n)], axis=1)
-        H = (J * weight[:, None]).T @ J
-        step = np.linalg.solve(H + prior, (J * weight[:, None]).T @ r - prior @ away)
+        share = used / len(source)
+        step = np.linalg.solve(H + prior, g - prior @ away)
         T, away = se3.exp(step) @ T, away + step
         if np.abs(step).max() < _STILL:
             break

@@ -14,7 +14,8 @@ from scipy.optimize import least_squares
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.align import align
 from sf_interfaces.types import Camera
-from sf_tracking.core.bundle import Problem, adjust, cost, information_root, jacobians, project, whiten
+from sf_tracking.core.bundle import Problem, adjust, cost, information_root, project
+from sf_tracking.core.bundle_reference import jacobians, whiten
 
 CAMERA = Camera(640, 480, 500.0, 480.0, 320.0, 240.0)
 

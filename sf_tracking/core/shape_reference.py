@@ -1,0 +1,57 @@
+"""What the compiled parts of surface alignment compute, in numpy; the tests hold one against the other."""
+
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sf_interfaces.types import Camera, Float32, Float64
+from sf_tracking.core.bundle_reference import robust
+
+
+def thin(z: Float32, step: int) -> tuple[NDArray[np.int64], Float64, Float64]:
+    """How many pixels of each block of ``step`` are known, their mean depth, and the difference of their extremes.
+
+    Args:
+        z: [H, W] m; NaN, infinite or not positive: unknown.
+    """
+    h, w = z.shape[0] // step, z.shape[1] // step
+    block = z[: h * step, : w * step].reshape(h, step, w, step).astype(np.float64)
+    known = (block > 0) & np.isfinite(block)
+    count = known.sum(axis=(1, 3))
+    mean = np.where(known, block, 0.0).sum(axis=(1, 3)) / np.maximum(count, 1)
+    low, high = np.where(known, block, np.inf).min(axis=(1, 3)), np.where(known, block, 0.0).max(axis=(1, 3))
+    return count, mean, np.where(count > 0, high - np.where(count > 0, low, 0.0), 0.0)
+
+
+def partners(camera: Camera, moved: Float64, grid: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of the target's point on whose cell each moved point [K, 3] falls, -1: none."""
+    h, w = grid.shape
+    uv, z = camera.project(moved)
+    with np.errstate(invalid="ignore"):
+        cell = np.floor(np.nan_to_num(uv) * (w / camera.width, h / camera.height)).astype(np.int64)
+        inside = (cell >= 0).all(axis=1) & (cell < (w, h)).all(axis=1) & (z > 0)
+    return np.where(inside, grid[np.clip(cell[:, 1], 0, h - 1), np.clip(cell[:, 0], 0, w - 1)], -1)
+
+
+def plane_system(
+    moved: Float64, sigma: Float64, partner: NDArray[np.int64], points: Float64, normals: Float64, reach: float,
+    scale: float, trust: float,
+) -> tuple[Float64, Float64, int]:  # fmt: skip
+    """H [6, 6], g [6] of the robust distances of moved points [K, 3] to the planes of their partners, and how many.
+
+    Args:
+        sigma: [K] m, deviation of the points; reach: relative to depth, how far apart partners may lie.
+    """
+    n, p = normals[partner], points[partner]
+    r = ((p - moved) * n).sum(axis=1)
+    with np.errstate(invalid="ignore"):
+        good = (partner >= 0) & np.isfinite(r) & (np.linalg.norm(p - moved, axis=1) < reach * moved[:, 2])
+    if not good.any():
+        return np.zeros((6, 6)), np.zeros(6), 0
+    n, r, moved = n[good], r[good], moved[good]
+    deviation = np.maximum(sigma[good], 1.4826 * np.median(np.abs(r)))
+    weight = robust((r / deviation) ** 2, scale)[0] / deviation**2 * trust
+    J = np.concatenate([n, np.cross(moved, n)], axis=1)
+    return (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r, int(good.sum())

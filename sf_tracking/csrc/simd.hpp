@@ -1,0 +1,27 @@
+// SPDX-License-Identifier: Apache-2.0
+// Hot loops are plain C++ on vectors of eight; on x86-64 Linux the compiler also emits them for AVX2 and AVX-512 and
+// the loader picks what the machine has. No contraction to fused multiply-add (see CMakeLists.txt): all round alike.
+#pragma once
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+
+#if defined(__x86_64__) && defined(__linux__) && defined(__GNUC__) && !defined(__clang__) && !defined(SF_NO_CLONES)
+#define SF_SIMD __attribute__((target_clones("default", "avx2", "arch=x86-64-v4")))
+#else
+#define SF_SIMD
+#endif
+#define SF_INLINE inline __attribute__((always_inline))
+
+namespace sf {
+
+typedef float Float8 __attribute__((vector_size(32), aligned(4)));
+typedef int32_t Int8 __attribute__((vector_size(32), aligned(4)));
+typedef double Double8 __attribute__((vector_size(64), aligned(8)));
+
+SF_INLINE const Float8& load8(const float* values) { return *reinterpret_cast<const Float8*>(values); }
+SF_INLINE Float8& store8(float* values) { return *reinterpret_cast<Float8*>(values); }
+
+SF_INLINE float sum(const Float8& v) { return ((v[0] + v[4]) + (v[1] + v[5])) + ((v[2] + v[6]) + (v[3] + v[7])); }
+
+}  // namespace sf
