@@ -26,6 +26,10 @@ from tests.tracking.box_room import CAMERA, BoxRoom, circle, warming_up
 pytestmark = [pytest.mark.graph, pytest.mark.timeout(900)]
 FAST = ["--set", "recon.iterations=8", "--set", "recon.final_iterations=8", "--set", "recon.pixels=1024"]
 SIZE = {"width": 320, "height": 240, "focal": 240.0, "supersampling": 1}
+COARSE = [f"--set={option}" for option in (
+    "recon.iterations=1", "recon.final_iterations=1", "recon.pixels=256", "recon.resolution=0.2", "recon.merge_gap=0",
+    "recon.mesh=none", "tracking.window=4", "tracking.patches=120",
+)]  # fmt: skip
 _domains = iter(range(40, 90))
 
 
@@ -42,7 +46,7 @@ def environment() -> dict[str, str]:
     return {**os.environ, **own}
 
 
-def sf(environment: dict[str, str], *args: str, timeout: float = 400) -> subprocess.CompletedProcess[str]:
+def sf(environment: dict[str, str], *args: str, timeout: float = 600) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "sf_bringup.cli", *args]
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=timeout)
 
@@ -97,8 +101,8 @@ def test_lossless_graph_equals_the_process_and_itself(bag: Path, environment: di
 def loop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A walk back to where it began, with depth that makes the tracker drift."""
     path = tmp_path_factory.mktemp("graph") / "loop.mcap"
-    room, poses = BoxRoom(3), circle(90, 72, 1.2)
-    frames = warming_up([room.frame(i, T, "dense") for i, T in enumerate(poses)], 18, 54)
+    room, poses = BoxRoom(3), circle(64, 48, 1.2)
+    frames = warming_up([room.frame(i, T, "dense") for i, T in enumerate(poses)], 12, 36)
     with SequenceWriter(path) as writer:
         for frame in frames:
             assert frame.image is not None and frame.depth is not None
@@ -108,10 +112,11 @@ def loop(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_loop_corrects_the_map_alike_in_both_engines(loop: Path, environment: dict[str, str], tmp_path: Path) -> None:
     outs = [tmp_path / name for name in ("inproc", "ros")]
     for out in outs:
-        args = ("--goal", "recon", "--engine", out.name, "--out", str(out), *FAST, "--set", "tracking.window=5")
+        args = ("--goal", "recon", "--engine", out.name, "--out", str(out), *COARSE)
         done = sf(environment, "run", str(loop), *args)
         assert done.returncode == 0, done.stderr
     corrected = [_corrections(out) for out in outs]

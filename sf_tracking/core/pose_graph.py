@@ -20,8 +20,8 @@ from sf_tracking.core import sim3
 _OUTLIER = 4.0  # deviations from which on a loop is taken for false
 _GRADUATION = 3.0  # factor by which the robust kernel narrows per step
 _STEPS = 40
-_STILL = 1e-7  # of a step, beyond which nothing changes any more
-_DAMPING = 1e-6
+_STILL = 1e-5  # of a step, beyond which nothing changes any more
+_DAMPING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
