@@ -26,6 +26,8 @@ FOLDER = {
         ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1", "--every", "10"],
     ),
     "depth": ([], ["--scenes", *_ROOMS, "hall", "--views", "10", "--factor", "1", "--oracle"]),
+    "live_map": ([], []),
+    "map_memory": (["--keyframes", "12"], ["--keyframes", "100"]),
     "scales": ([], ["--frames", "400", "--factor", "1"]),
     "real": ([], ["--frames", "1000"]),
 }
@@ -36,7 +38,7 @@ FILE = {
     "play_record": (["--frames", "90", "--rates", "1", "4"], []),
     "completion": ([], []),
 }
-NEED_DATA = ("real", "completion")
+NEED_DATA = ("real", "completion", "live_map")
 
 
 def commands(full: bool, data: Path | None, out: Path) -> dict[str, list[str]]:

@@ -1,8 +1,8 @@
 """A map of half a million points that is looked at while it learns: steps, frames a second, time to a PSNR, memory.
 
-    python benchmarks/live_map.py FOLDER/rgbd_7scenes_redkitchen_000_199 [--resolution 0.004] [--seconds 4]
+    python benchmarks/live_map.py --data FOLDER [--resolution 0.006] [--seconds 4]
 
-All keyframes but the last are placed and trained as a line does it. Then: optimiser steps a second of the trainer
+FOLDER holds ``rgbd_7scenes_*``. All keyframes but the last are placed and trained as a line does it. Then: optimiser steps a second of the trainer
 alone; frames a second at 640x480 from the poses of held-out frames, with the JPEG of the viewer, while the map rests
 and while it learns; and how long the last keyframes take from their arrival to 25 dB in the learning thread.
 """
@@ -71,13 +71,16 @@ def to_goal(built: Reconstruction, keys: list[Keyframe], lock: FairLock, patienc
 def main() -> None:
     """One row."""
     bench = Benchmark("live_map", __doc__ or "")
-    bench.parser.add_argument("data", type=Path, help="folder of a 7-Scenes sequence, or a simulated bag")
-    bench.parser.add_argument("--resolution", type=float, default=0.004, help="m")
+    bench.parser.add_argument("--data", type=Path, required=True, help="folder of real recordings")
+    bench.parser.add_argument("--resolution", type=float, default=0.0055, help="m")
     bench.parser.add_argument("--frames", type=int, default=200)
     bench.parser.add_argument("--step", type=int, default=8, help="every n-th frame is a keyframe")
     bench.parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement")
     args = bench.parse()
-    keys, held = load(args.data, args.frames, args.step)
+    recording = next(iter(sorted(args.data.glob("rgbd_7scenes_*"))), None)
+    if recording is None:
+        bench.parser.error(f"{args.data} holds no rgbd_7scenes_* folder")
+    keys, held = load(recording, args.frames, args.step)
     built = Reconstruction(ReconConfig(resolution=args.resolution, iterations=10))
     for key in keys[:-LAST]:
         built.add(key)
