@@ -2,9 +2,10 @@
 
     python benchmarks/live_map.py --data FOLDER [--resolution 0.006] [--seconds 4]
 
-FOLDER holds ``rgbd_7scenes_*``. All keyframes but the last are placed and trained as a line does it. Then: optimiser steps a second of the trainer
-alone; frames a second at 640x480 from the poses of held-out frames, with the JPEG of the viewer, while the map rests
-and while it learns; and how long the last keyframes take from their arrival to 25 dB in the learning thread.
+FOLDER holds ``rgbd_7scenes_*``. All keyframes but the last are placed and trained as a line does it. Then: optimiser
+steps a second of the trainer alone; frames a second at 640x480 from the poses of held-out frames, with the JPEG of
+the viewer, while the map rests and while it learns; and how long the last keyframes take from their arrival to 25 dB
+in the learning thread.
 """
 
 # SPDX-License-Identifier: Apache-2.0

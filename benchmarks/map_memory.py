@@ -2,9 +2,9 @@
 
     python benchmarks/map_memory.py [--scenes palace campus] [--keyframes 40] [--assumed 300]
 
-Each keyframe gets one training step, so that the optimiser's moments are there. The weight at ``--assumed`` keyframes is extrapolated from the
-growth over the last half: too much where the path comes back to what was seen. Exact depth without a variance is the
-heaviest case, an uncertain one places fewer points.
+Each keyframe gets one training step, so that the optimiser's moments are there. The weight at ``--assumed``
+keyframes is extrapolated from the growth over the last half: too much where the path comes back to what was seen.
+Exact depth without a variance is the heaviest case, an uncertain one places fewer points.
 """
 
 # SPDX-License-Identifier: Apache-2.0
