@@ -26,6 +26,8 @@ FOLDER = {
         ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1", "--every", "10"],
     ),
     "depth": (["--line", "room0"], ["--all", "--oracle", "--line", *_ROOMS, "hall"]),
+    "live_map": ([], []),
+    "map_memory": (["--keyframes", "12"], ["--keyframes", "100"]),
     "scales": ([], ["--frames", "400", "--factor", "1"]),
     "real": ([], ["--frames", "1000"]),
 }
@@ -36,8 +38,8 @@ FILE = {
     "play_record": (["--frames", "90", "--rates", "1", "4"], []),
     "completion": ([], []),
 }
-USE_DATA = ("real", "completion", "depth")
-NEED_DATA = ("real", "completion")
+NEED_DATA = ("real", "completion", "live_map")
+USE_DATA = (*NEED_DATA, "depth")
 
 
 def commands(full: bool, data: Path | None, out: Path) -> dict[str, list[str]]:

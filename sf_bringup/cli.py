@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -324,6 +325,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb. Returns 0 done, 2 bad input (one sentence on stderr); a bug raises (exit code 1)."""
     argv = list(sys.argv[1:] if argv is None else argv)
+    # Read when the first library with OpenMP is loaded: its threads must not spin while others need the cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         if argv and argv[0] in PASSED_ON:
             return int(importlib.import_module(PASSED_ON[argv[0]][0]).main(argv[1:]) or 0)

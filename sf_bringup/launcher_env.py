@@ -20,6 +20,7 @@ def node_environment(domain_id: int | None = None) -> dict[str, str]:
         "MALLOC_MMAP_THRESHOLD_": _LARGE,
         "MALLOC_TRIM_THRESHOLD_": _LARGE,
         "OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // 3)),  # the nodes share the cores; more threads fight
+        "OMP_WAIT_POLICY": "PASSIVE",  # threads that wait sleep; spinning, they take the cores of the other nodes
         "PYTHONUNBUFFERED": "1",
     }
     environment = {**defaults, **os.environ}

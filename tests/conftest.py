@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # before torch: threads that wait must not spin
 SHARED = Path(os.environ.get("SF_SHARED", Path(__file__).resolve().parents[2] / "shared"))
 
 

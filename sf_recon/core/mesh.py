@@ -98,11 +98,13 @@ def _drawn(reconstruction: Reconstruction) -> Iterator[tuple[Camera, Float64, Fl
 
 
 def _cleaned(mesh: Mesh) -> Mesh:
-    """Without crumbs, with normals."""
+    """Without crumbs, with normals and colours in 0..1."""
     pieces, sizes, _ = mesh.cluster_connected_triangles()
     if len(sizes):
         mesh.remove_triangles_by_mask(np.asarray(sizes)[np.asarray(pieces)] < _SMALLEST)
         mesh.remove_unreferenced_vertices()
+    colors = np.asarray(mesh.vertex_colors)  # shares the mesh's memory
+    np.clip(colors, 0, 1, out=colors)
     mesh.compute_vertex_normals()
     return mesh
 

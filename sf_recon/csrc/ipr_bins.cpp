@@ -33,6 +33,7 @@ void Binner::project(const float* points, size_t first, size_t last, const Raste
     Projected p;
     uint32_t rows[kBlock];
     Visible* out = visible_.get() + first;
+    size_t* counts = offset_.data() + chunk * static_cast<size_t>(bins_.tiles_x * bins_.tiles_y);
     bool covers = false;
     for (size_t start = first; start < last; start += kBlock) {
         const size_t n = std::min(kBlock, last - start);
@@ -48,14 +49,16 @@ void Binner::project(const float* points, size_t first, size_t last, const Raste
             out->x0 = static_cast<uint16_t>(p.x0[i] / kTile), out->x1 = static_cast<uint16_t>(p.x1[i] / kTile);
             out->y0 = static_cast<uint16_t>(p.y0[i] / kTile), out->y1 = static_cast<uint16_t>(p.y1[i] / kTile);
             covers |= p.x1[i] - p.x0[i] >= kTile - 1 && p.y1[i] - p.y0[i] >= kTile - 1;
+            for (int ty = out->y0; ty <= out->y1; ++ty)  // now, while the point is in the cache
+                for (int tx = out->x0; tx <= out->x1; ++tx) ++counts[ty * bins_.tiles_x + tx];
         }
     }
     first_[chunk] = first;
     found_[chunk] = static_cast<size_t>(out - (visible_.get() + first));
     covers_[chunk] = covers;
-    count(chunk);
 }
 
+// Counts anew what lies before the bounds of the tiles.
 void Binner::count(int chunk) {
     size_t* counts = offset_.data() + chunk * static_cast<size_t>(bins_.tiles_x * bins_.tiles_y);
     const Visible* v = visible_.get() + first_[chunk];

@@ -35,33 +35,45 @@ SF_SIMD void project_run(const SourceView& view, const BlendRules& rules, const 
         const float border = (across < down ? across : down) / feather;
         const float faded = border < 1.0f ? border : 1.0f;
         p.x[i] = x, p.y[i] = y, p.d[i] = divisor;
-        p.inside[i] = ahead & (faded > 0.0f) ? faded : 0.0f;  // also for what is not a number
+        p.inside[i] = ahead & (border > 0.0f) ? faded : 0.0f;  // false for what is not a number
     }
 }
 
-// color += weight * the image between its pixels' centres.
-SF_INLINE void add_sample(const SourceView& view, float x, float y, float weight, float* color) {
-    x -= 0.5f, y -= 0.5f;
-    const float fx = std::floor(x), fy = std::floor(y), s = x - fx, t = y - fy;
-    const int x0 = std::max(static_cast<int>(fx), 0), x1 = std::min(static_cast<int>(fx) + 1, view.width - 1);
-    const int y0 = std::max(static_cast<int>(fy), 0), y1 = std::min(static_cast<int>(fy) + 1, view.height - 1);
-    const uint8_t* upper = view.image + 3 * static_cast<size_t>(y0) * view.width;
-    const uint8_t* lower = view.image + 3 * static_cast<size_t>(y1) * view.width;
-    const float a = weight * (1 - s) * (1 - t), b = weight * s * (1 - t), c = weight * (1 - s) * t, d = weight * s * t;
-    for (int k = 0; k < 3; ++k)
-        color[k] += a * upper[3 * x0 + k] + b * upper[3 * x1 + k] + c * lower[3 * x0 + k] + d * lower[3 * x1 + k];
+typedef uint8_t Bytes8 __attribute__((vector_size(8), aligned(1)));
+
+SF_INLINE Float8 bytes8(const uint8_t* bytes) {
+    return __builtin_convertvector(*reinterpret_cast<const Bytes8*>(bytes), Float8);
 }
 
-void blend_run(const SourceView& view, const BlendRules& rules, const Places& p, const uint8_t* surface, int n,
-               float* color, float* total, float* confidence) {
+// color += weight * the image between its pixels' centres; x and y are positive.
+SF_INLINE void add_sample(const SourceView& view, float x, float y, float weight, float* color) {
+    const int left = static_cast<int>(x + 0.5f) - 1, top = static_cast<int>(y + 0.5f) - 1;  // -1: half a pixel outside
+    const float s = x - 0.5f - static_cast<float>(left), t = y - 0.5f - static_cast<float>(top);
+    const int y0 = std::max(top, 0), y1 = std::min(top + 1, view.height - 1);
+    const uint8_t* upper = view.image + 3 * static_cast<size_t>(y0) * view.width;
+    const uint8_t* lower = view.image + 3 * static_cast<size_t>(y1) * view.width;
+    const float above = weight * (1 - t), below = weight * t;
+    if (left >= 0 && left + 3 <= view.width - 1) {  // eight bytes from the left pixel lie in the row
+        const Float8 mixed = above * bytes8(upper + 3 * left) + below * bytes8(lower + 3 * left);
+        for (int k = 0; k < 3; ++k) color[k] += (1 - s) * mixed[k] + s * mixed[k + 3];
+        return;
+    }
+    const int x0 = std::max(left, 0), x1 = std::min(left + 1, view.width - 1);
+    for (int k = 0; k < 3; ++k)
+        color[k] += (1 - s) * (above * upper[3 * x0 + k] + below * lower[3 * x0 + k]) +
+                    s * (above * upper[3 * x1 + k] + below * lower[3 * x1 + k]);
+}
+
+SF_SIMD void blend_run(const SourceView& view, const BlendRules& rules, const Places& p, const uint8_t* surface, int n,
+                       float* color, float* total, float* confidence) {
     for (int i = 0; i < n; ++i) {
         if (p.inside[i] == 0.0f) continue;
         const size_t column = std::min(static_cast<int>(p.x[i]), view.width - 1);
         const size_t row = std::min(static_cast<int>(p.y[i]), view.height - 1);
-        const uint16_t steps = view.depth[row * view.width + column];
+        const int steps = view.depth[row * view.width + column];
         float agreement = rules.unknown;
         if (steps != 0) {
-            const float off = surface[i] ? std::abs(steps * view.step - p.d[i]) / p.d[i] : 0.0f;
+            const float off = surface[i] ? std::abs(static_cast<float>(steps) * view.step - p.d[i]) / p.d[i] : 0.0f;
             if (off >= rules.other) continue;
             agreement = 1 / (1 + (off / rules.doubt) * (off / rules.doubt));
         }

@@ -51,6 +51,7 @@ def test_the_launch_file_has_few_arguments_and_starts_what_sf_up_understands(lau
     values |= {"goal": "slam", "points": "/velodyne_points", "config": str(HERE / "config" / "rgbl.yaml")}
     given = parse(launch_file.command(values)[4:])
     assert given.goal == "slam" and given.map == ["lidar=/velodyne_points"] and given.config.is_file()
+    assert parse([]).view is None and parse(["--view"]).view == 8080 and parse(["--view", "9000"]).view == 9000
 
 
 @pytest.mark.parametrize("path", sorted((HERE / "config").glob("*.yaml")), ids=lambda path: path.stem)
