@@ -14,24 +14,36 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sf_bringup.simulate import PRESETS, Simulator
+from sf_bringup.simulate import PRESETS, SimulationSpec, Simulator
+from sf_bringup.simulate.ames import EYE
+from sf_bringup.simulate.render import Renderer
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.registration import register_depth
 from sf_interfaces.io.datasets.indoor import SevenScenes
 from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
-# Preset, seconds along its path, views, baseline over depth, largest roll deg. The first few serve a quick run.
+# Scene, seconds along its path, views, baseline over depth, largest roll deg. The first few serve a quick run; "ames"
+# is an Ames room seen from the place where it looks like an ordinary one.
 SIMULATED = (
     ("room", 12.0, 5, 0.15, 3.0),
     ("campus", 10.0, 6, 0.15, 3.0),
     ("room0", 20.0, 5, 0.15, 25.0),
+    ("ames", 0.0, 5, 0.12, 3.0),
     ("demo", 1.0, 5, 0.12, 3.0),
     ("room", 40.0, 8, 0.12, 3.0),
     ("hall", 20.0, 6, 0.12, 3.0),
 )
-SEVEN_SCENES = ((120, 100, 110, 130, 140), (150, 110, 130, 170, 190), (180, 140, 160, 170, 199))
-QUICK_SIMULATED, QUICK_SEVEN_SCENES = 3, 2
+# The reference first. Every tenth frame around it, and for comparison with earlier results sets of five.
+SEVEN_SCENES = (
+    (130, 100, 110, 120, 140, 150, 160),
+    (150, 110, 130, 170, 190),
+    (160, 130, 140, 150, 170, 180, 190),
+    (140, 110, 120, 130, 150, 160, 170),
+    (120, 100, 110, 130, 140),
+    (180, 140, 160, 170, 199),
+)
+QUICK_SIMULATED, QUICK_SEVEN_SCENES = 4, 2
 FOUNTAIN = (5, 3, 4, 6, 7)
 
 
@@ -62,27 +74,29 @@ def simulated(everything: bool = True) -> Iterator[ImageSet]:
     """Views from around a place of a scene's path, turned to nearly the same point, with sensor noise."""
     chosen = SIMULATED if everything else SIMULATED[:QUICK_SIMULATED]
     for seed, (preset, seconds, count, baseline, roll) in enumerate(chosen):
-        simulator = Simulator(PRESETS[preset])
-        rng = np.random.default_rng(seed)
-        first = simulator.path.pose(seconds)
-        yield _around(f"{preset} {seconds:.0f} s", simulator, first, count, baseline, roll, rng)
+        simulator = Simulator(PRESETS.get(preset) or SimulationSpec(preset))
+        renderer, rng = simulator.renderer, np.random.default_rng(seed)
+        name, first = f"{preset} {seconds:.0f} s", simulator.path.pose(seconds)
+        if preset == "ames":
+            name, first = preset, _toward(np.array(EYE), np.add(EYE, (1.0, 0.0, 0.0)), 0.0)
+        yield _around(name, renderer, first, count, baseline, roll, rng)
 
 
 def _around(
-    name: str, simulator: Simulator, first: Float64, count: int, baseline: float, roll: float, rng: np.random.Generator
+    name: str, renderer: Renderer, first: Float64, count: int, baseline: float, roll: float, rng: np.random.Generator
 ) -> ImageSet:
     """The view ``first`` and others that look at what it sees."""
-    image, z = simulator.renderer.render(CAMERA, first)
+    image, z = renderer.render(CAMERA, first)
     poses, images, depth, angle = [first], [image], float(np.nanmedian(z)), 0.0
     while len(poses) < count:
         angle += 2 * np.pi / (count - 1) + rng.uniform(-0.3, 0.3)
         step = baseline * depth * np.array([np.cos(angle), 0.6 * np.sin(angle), rng.uniform(-0.5, 0.5)])
         eye = first[:3, 3] + first[:3, :3] @ step
-        if simulator.renderer.clearance(eye[None])[0] < 0.15 * min(depth, 3.0):
+        if renderer.clearance(eye[None])[0] < 0.15 * min(depth, 3.0):
             continue
         target = first[:3, 3] + first[:3, 2] * depth + rng.normal(0, 0.06 * depth, 3)
         poses.append(_toward(eye, target, rng.uniform(-roll, roll)))
-        images.append(simulator.renderer.render(CAMERA, poses[-1])[0])
+        images.append(renderer.render(CAMERA, poses[-1])[0])
     noisy = [np.clip(i + rng.standard_normal(i.shape) + 0.5, 0, 255).astype(np.uint8) for i in images]
     return ImageSet(name, CAMERA, noisy, poses, DepthMap(z))
 
@@ -115,7 +129,7 @@ def seven_scenes(folder: Path, sets: tuple[tuple[int, ...], ...]) -> Iterator[Im
         truth = register_depth(measured, SevenScenes.DEPTH_CAMERA, SevenScenes.COLOR_CAMERA, T)
         poses = [se3.orthonormalise(np.loadtxt(f"{stem}.pose.txt")) @ se3.inverse(T) for stem in stems]
         images = [_rgb(Path(f"{stem}.color.jpg")) for stem in stems]
-        yield ImageSet(f"7-Scenes {frames[0]}", SevenScenes.COLOR_CAMERA, images, poses, truth)
+        yield ImageSet(f"7-Scenes {frames[0]}, {len(frames)} views", SevenScenes.COLOR_CAMERA, images, poses, truth)
 
 
 def fountain(folder: Path, factor: float = 0.5) -> ImageSet:

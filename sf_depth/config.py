@@ -12,7 +12,7 @@ from sf_interfaces.config import option
 class DepthConfig:
     """How sparse depth becomes dense depth with variance (paper Sec. ScaleCov)."""
 
-    mode: str = option("complete", "what the node does: complete, slam or posed")
+    mode: str = option("complete", "what the node does: complete, slam, posed or mvd (calls only)")
     # completion (ScaleCov)
     neighbours: int = option(16, "observations each tile of pixels is conditioned on", low=4, high=64)
     tile: int = option(4, "side in px of the tiles that share their observations", low=1, high=32)

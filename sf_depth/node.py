@@ -9,13 +9,16 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from sf_depth import service
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
+from sf_depth.core.one_shot import OneShot
 from sf_depth.core.sequence import EachDepth, PosedSetting, SequenceDepth, SlamSetting
 from sf_interfaces import topics
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.bundles import COMPLETED, publish_bundle
+from sf_interfaces.ros.calls import forwarded
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.process import run
@@ -25,20 +28,32 @@ from sf_interfaces.types import Keyframe, PointCloud
 class DepthNode(BlockNode):
     """Completes the depth (Sec. III-C): sparse depth (mode ``complete``) or none (``slam``, ``posed``).
 
-    With ``source: sensors`` it is the head of its line and sends what a tracker would of its keyframes too.
+    With ``source: sensors`` it is the head of its line and sends what a tracker would of its keyframes too. The
+    service ``estimate_depth`` is there in every mode, and alone in mode ``mvd``.
     """
 
     short: ClassVar[str] = "depth"
     config_class: ClassVar[type] = DepthConfig
     defaults: ClassVar[dict[str, Any]] = {"source": "tracking"}
 
+    def __init__(self) -> None:
+        from sf_interfaces.srv import EstimateDepth
+
+        super().__init__()
+        self._one_shot: OneShot | None = None
+        self.service(EstimateDepth, "estimate_depth", forwarded(self, "estimate"))
+
     def setup(self) -> None:
         """The completer and its keyframes."""
         self.leader = ""
-        self._depth = self._part(self.config())
+        config = self.config()
+        self._one_shot = OneShot(config)
+        self._depth = self._part(config)
+        if self._depth is None:
+            return
         self._source = KeyframeSource(self, landmarks=True)
         # Which frames get depth is known at once (complete), or only when they have it (posed).
-        self._at_once = self.config().mode == "complete"
+        self._at_once = config.mode == "complete"
         self._source.announces({"image", "camera_info", "pose", "state", *(("depth",) if self._at_once else ())})
         self._parts = set(COMPLETED) - {"image", "state"} - (set() if self._source.posed else {"pose"})
         for kind in self._parts:
@@ -46,25 +61,30 @@ class DepthNode(BlockNode):
         self.output(topics.DENSE_POINTS)
 
     def take(self, kind: str, msg: Any) -> None:
-        """Complete the keyframes one message makes ready."""
+        """Complete the keyframes one message makes ready, or answer a call."""
+        if kind == "estimate":
+            msg.answer(self._estimate)
+            return
         for keyframe in self._source.push(kind, msg):
             self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
 
     def finish(self) -> None:
         """Complete what was still waiting."""
+        if self._depth is None:
+            return
         for keyframe in self._source.end():
             self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
         self.guarded(lambda: self._send(self._depth.finish()))
 
     def refresh(self) -> None:
         """Why input was dropped."""
-        if self.leader:
+        if self.leader and self._depth is not None:
             self.health.set_drops(self._source.reasons | self._depth.reasons)
             self.health.waiting(self._source.waiting_for)
 
     @staticmethod
-    def _part(config: DepthConfig) -> SequenceDepth | EachDepth:
-        """The core of the configured mode.
+    def _part(config: DepthConfig) -> SequenceDepth | EachDepth | None:
+        """The core of the configured mode; none for ``mvd``, which only serves calls.
 
         Raises:
             ConfigError: the mode does not run as a node.
@@ -75,9 +95,19 @@ class DepthNode(BlockNode):
             return SequenceDepth(config, SlamSetting())
         if config.mode == "posed":
             return SequenceDepth(config, PosedSetting(config.keyframe_baseline))
-        raise ConfigError(f"mode '{config.mode}' of the depth node is not known; use complete, slam or posed")
+        if config.mode == "mvd":
+            return None
+        raise ConfigError(f"mode '{config.mode}' of the depth node is not known; use complete, slam, posed or mvd")
+
+    def _estimate(self, request: Any, response: Any) -> None:
+        if self._one_shot is None:
+            response.message = "the depth node is not configured yet; configure it and call again"
+            return
+        service.answer(self._one_shot, request, response)
+        self.health.count("calls answered")
 
     def _add(self, keyframe: Keyframe) -> None:
+        assert self._depth is not None
         if self._at_once:
             self._source.announce(keyframe)
         self._send(self._depth.add(keyframe))

@@ -10,17 +10,15 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
-
-from rclpy.task import Future
 
 from sf_interfaces import topics
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.io.paths import inside
 from sf_interfaces.ros import messages
+from sf_interfaces.ros.calls import forwarded
 from sf_interfaces.ros.inbox import Inbox
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
@@ -31,15 +29,6 @@ from sf_recon.core.learner import FairLock, Learner
 from sf_recon.core.reconstruction import Reconstruction
 
 _SNAPSHOT_KEYFRAMES = 15  # upstream keeps twice as many for a restarted node
-
-
-@dataclass(frozen=True, slots=True)
-class _Request:
-    """A service call on its way to the worker, which alone touches the core."""
-
-    request: Any
-    response: Any
-    done: Future
 
 
 class ReconNode(BlockNode):
@@ -53,8 +42,8 @@ class ReconNode(BlockNode):
         from sf_interfaces.srv import RenderView, SaveMap
 
         super().__init__()
-        self.service(RenderView, "render_view", self._forward("render"))
-        self.service(SaveMap, "save_map", self._forward("save"))
+        self.service(RenderView, "render_view", forwarded(self, "render"))
+        self.service(SaveMap, "save_map", forwarded(self, "save"))
 
     def setup(self) -> None:
         """The reconstruction and its keyframes."""
@@ -91,7 +80,7 @@ class ReconNode(BlockNode):
             case "view" | "render":
                 self._draw_one(kind, msg)
             case "save":
-                self._answer(msg, self._save_service)
+                msg.answer(self._save_service)
             case _:
                 for keyframe in self._source.push(kind, msg):
                     self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
@@ -188,7 +177,7 @@ class ReconNode(BlockNode):
         if kind == "view":
             self._view(msg)
         else:
-            self._answer(msg, self._render_service)
+            msg.answer(self._render_service)
 
     def _view(self, msg: Any) -> None:
         wanted = [topic for topic in (topics.VIEW_IMAGE, topics.VIEW_DEPTH) if self.wanted(topic)]
@@ -206,26 +195,7 @@ class ReconNode(BlockNode):
         image = messages.encode_image(messages.rclpy_factory, view.image, stamp_ns, camera.frame_id)
         return image, messages.encode_depth(messages.rclpy_factory, view.depth, stamp_ns, camera.frame_id)
 
-    # ---- services: the executor hands the call to the worker and awaits it
-
-    def _forward(self, kind: str) -> Any:
-        async def call(request: Any, response: Any) -> Any:
-            if self._worker is None or not self._worker.is_alive():
-                # After the end of the stream the worker is gone and the core is free.
-                job = _Request(request, response, Future())
-                self.take(kind, job)
-                return response
-            job = _Request(request, response, Future(executor=self.executor))
-            self.enqueue(kind, job)
-            return await job.done
-
-        return call
-
-    def _answer(self, job: _Request, serve: Any) -> None:
-        try:
-            serve(job.request, job.response)
-        finally:
-            job.done.set_result(job.response)
+    # ---- services, answered by the worker
 
     def _render_service(self, request: Any, response: Any) -> None:
         if self._camera is not None:

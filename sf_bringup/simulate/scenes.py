@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sf_bringup.simulate import furniture as f
+from sf_bringup.simulate.ames import ames
 from sf_bringup.simulate.builder import Light, Scene, SceneBuilder
 
 _WARM = (1.0, 0.95, 0.86)
@@ -274,6 +275,7 @@ def _block(b: SceneBuilder, index: int) -> None:
 
 SCENES: dict[str, Callable[[int], Scene]] = {
     **{name: (lambda seed, plan=plan: furnished_room(plan, seed)) for name, plan in ROOMS.items()},
+    "ames": lambda seed: ames(furnished_room(ROOMS["room2"], seed)),
     "hall": hall,
     "palace": palace,
     "campus": campus,

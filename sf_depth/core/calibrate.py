@@ -15,6 +15,7 @@ from sf_interfaces.types import Camera, UInt8
 _STEP = 0.035  # image widths of motion between two views that are used
 _VIEWS = 6  # views a calibration is made from
 _GOOD = 0.01  # relative deviation of the focal length that is good enough to go on
+_ENOUGH = 10  # views after which more of the same would not make it surer: what the lens adds does not average out
 
 
 class Calibrator:
@@ -47,7 +48,8 @@ class Calibrator:
             self._views = self._views[::2]
             return None
         assert self.result is not None
-        return self.result.camera if self.result.focal_sigma < _GOOD else None
+        done = self.result.focal_sigma < _GOOD or len(self._views) >= _ENOUGH
+        return self.result.camera if done else None
 
     def finish(self) -> Camera:
         """The camera from what has come, at the end of the input.

@@ -65,7 +65,7 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
             index = everywhere
         tree = cKDTree(index)
         count = min(_NEIGHBOURS, len(index) - 1)
-        distance, near = tree.query(index, k=count + 1)
+        distance, near = tree.query(index, k=count + 1, workers=-1)
         first.append(sum(map(len, indices)))
         spacings.append(distance[:, min(6, count)])
         nears.append(np.pad(near[:, 1:], ((0, 0), (0, _NEIGHBOURS - count)), mode="edge") + first[-1])
@@ -121,7 +121,7 @@ def choose(observed: Observations, center: Float64, count: int, excluded: Float6
     distances, chosen = [], []
     for tree, first in zip(observed.trees, observed.first, strict=True):
         wanted = min(_CANDIDATES if excluded is None else 3 * _CANDIDATES, tree.n)
-        distance, near = tree.query(center, k=wanted)
+        distance, near = tree.query(center, k=wanted, workers=-1)
         distances.append(distance.reshape(len(center), wanted))
         chosen.append(near.reshape(len(center), wanted) + first)
     d = torch.from_numpy(np.concatenate(distances, axis=1).astype(np.float32))

@@ -17,6 +17,7 @@ from sf_interfaces.types import DepthMap, Float32, Keyframe
 # which no interpolation of what was seen can know. What poses and calibration get wrong around a gap they get wrong
 # in it, too: the relative variance of the nearest triangulated pixel is added.
 _UNSEEN = 1.0
+_FIRST_WINDOW, _WINDOWS = 4.0, 6  # px, half the side of the smallest window; each of the others is twice as wide
 
 
 class Filler:
@@ -50,7 +51,8 @@ class Filler:
         assert full.depth is not None and full.depth.variance is not None
         assert seen is not None and seen.variance is not None
         away, owner = _nearest(seen.valid)
-        unseen = (_UNSEEN * away / keyframe.camera.width) ** 2 + (seen.variance / seen.z**2)[owner] * ~seen.valid
+        unseen = (_UNSEEN * away / keyframe.camera.width) ** 2
+        unseen += np.where(seen.valid, 0.0, (seen.variance / seen.z**2)[owner] + _disagreement(seen.z, away))
         variance = full.depth.variance + unseen * full.depth.z**2
         return replace(full, depth=DepthMap(full.depth.z, variance, full.depth.scale))
 
@@ -62,3 +64,21 @@ def _nearest(valid: np.ndarray) -> tuple[Float32, tuple[np.ndarray, np.ndarray]]
     place = np.zeros(int(label.max()) + 1, np.int64)
     place[label[valid]] = np.flatnonzero(valid)
     return np.asarray(away), np.unravel_index(place[label], valid.shape)
+
+
+def _disagreement(z: Float32, away: Float32) -> Float32:
+    """Variance [H, W] of the log depth seen around every pixel, in a window of twice its distance [H, W] px to it.
+
+    What a gap hides belongs to one of the surfaces around it, and which one is a guess.
+    """
+    seen = np.isfinite(z).astype(np.float32)
+    log = np.log(np.where(seen > 0, z, 1.0)).astype(np.float32)
+    level = np.clip(np.log2(2.0 * np.maximum(away, 1.0) / _FIRST_WINDOW), 0, _WINDOWS - 1)
+    out = np.zeros_like(log)
+    for k in range(_WINDOWS):
+        side = int(2 * _FIRST_WINDOW * 2**k) + 1
+        count, first, second = (cv2.blur(part, (side, side)) for part in (seen, seen * log, seen * log * log))
+        mean = first / np.maximum(count, 1e-6)
+        own = np.maximum(second / np.maximum(count, 1e-6) - mean * mean, 0.0)
+        out += np.maximum(1.0 - np.abs(level - k), 0.0).astype(np.float32) * own
+    return out

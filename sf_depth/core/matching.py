@@ -164,9 +164,9 @@ def flow(first: UInt8, second: UInt8, fine: bool = False) -> Float32:
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     if fine:  # the preset ends at half of it; fewer steps a patch suffice there
         search.setFinestScale(0)
-        search.setPatchStride(4)
+        search.setPatchStride(5)
         search.setGradientDescentIterations(8)
-        search.setVariationalRefinementIterations(3)
+        search.setVariationalRefinementIterations(2)
     return np.asarray(search.calc(first, second, None), dtype=np.float32)
 
 

@@ -25,7 +25,7 @@ from sf_interfaces.errors import FormatError
 from sf_interfaces.types import DepthMap, Float32, UInt8
 
 MIN_OBSERVATIONS = 4  # a plane and one to spare
-_CHUNK = 1024  # tiles solved at once; few enough to stay in the processor's cache
+_CHUNK = 256  # tiles solved at once; few enough to stay in the cache of the processor
 _LAYER_SCALE = 0.15  # difference of log scale over which correlation falls to 0.6
 _MIN_AMPLITUDE = 1e-8  # variance of log scale that is left on a perfect plane
 
