@@ -22,7 +22,8 @@ _SEARCHED = 200  # patches searched over levels to find the motion
 _WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must not be rejected far from the truth
 _AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
 _MOST = 0.5  # share of them that must agree on a pose far from the predicted one
-_CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
+_CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a second alignment needless
+_LIKELY = (0.5, 0.6)  # the same that make a search needless
 _MOTION = np.diag([0.03**-2] * 3 + [0.02**-2] * 3)  # information of a predicted pose, m and rad
 _HONEST, _PLENTY = 1.5, 80  # excess of errors and number of patches, from which patches alone are trusted
 _FAR = 1e-6  # inverse depth, 1/m, below which a point counts as that far
@@ -58,6 +59,10 @@ class Location:
     def doubtful(self) -> bool:
         """Patches err more than they claim, or are few: measured depth has something to add."""
         return self.excess > _HONEST or self.inliers < _PLENTY
+
+    def passes(self, shares: tuple[float, float]) -> bool:
+        """Whether more than these shares of the patches were found, and of those agree."""
+        return self.found > shares[0] and self.inliers > shares[1] * len(self.sights)
 
 
 def blind_location(T_cw: Float64) -> Location:
@@ -100,13 +105,17 @@ class Locator:
 
         A smooth motion is predicted well enough to align at once; else the search over levels comes first.
         """
-        at_once = None if wide else self.align(window, view, predicted)
-        if at_once is not None and at_once.found > _CERTAIN[0] and at_once.inliers > _CERTAIN[1] * len(at_once.sights):
-            return at_once
+        near = None if wide else self.align(window, view, predicted)
+        if near is not None and not near.passes(_CERTAIN):
+            # Nearer to the truth more patches lie within the reach of alignment.
+            again = self.align(window, view, near.T_cw)
+            near = again if again is not None and again.support > near.support else near
+        if near is not None and near.passes(_LIKELY):
+            return near
         T_cw = self._search(window, view, predicted, wide)
         searched = None if T_cw is None else self.align(window, view, T_cw)
         # Where much of the image moves on its own, the search may follow it; most patches decide.
-        return max((f for f in (at_once, searched) if f is not None), key=lambda f: f.support, default=None)
+        return max((f for f in (near, searched) if f is not None), key=lambda f: f.support, default=None)
 
     def _search(self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, wide: bool) -> Float64 | None:
         """A first pose from the newest keyframes' patches, found over the levels of the pyramid."""
