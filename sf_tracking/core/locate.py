@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ class Sights:
     patch: NDArray[np.int64]  # [E] index of the patch in the keyframe
     uv: Float64  # [E, 2] px
     information: Float64  # [E, 2, 2] 1/px^2, of the alignment alone
+    J_w: Float64  # [E, 2] d(uv)/d(inverse depth)
 
     def __len__(self) -> int:
         return len(self.keyframe)
@@ -81,14 +82,15 @@ def align_sights(
     """Sights of the patches ``take`` of one keyframe, corrected from their reprojections."""
     update = operator(keyframe.described.take(take), target, at.uv[take], at.warp[take])
     ok = update.valid
-    return Sights(np.full(int(ok.sum()), index), take[ok], update.target[ok], update.information[ok])
+    found = take[ok]
+    return Sights(np.full(len(found), index), found, update.target[ok], update.information[ok], at.J_w[found])
 
 
 def join(parts: Sequence[Sights]) -> Sights:
     """All sights of several keyframes."""
-    none = Sights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    none = Sights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2)))
     parts = parts or [none]
-    return Sights(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("keyframe", "patch", "uv", "information")))
+    return Sights(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Sights)))
 
 
 class Locator:
@@ -128,7 +130,7 @@ class Locator:
             uv, ok = search(self._config, keyframe.view, keyframe.patches.uv[take], view, start, wide=wide)
             tried += len(take)
             sigma = np.broadcast_to(np.eye(2) / _SEARCH_SIGMA**2, (int(ok.sum()), 2, 2))
-            parts.append(Sights(np.full(int(ok.sum()), index), take[ok], uv[ok], sigma))
+            parts.append(Sights(np.full(int(ok.sum()), index), take[ok], uv[ok], sigma, at.J_w[take[ok]]))
             if len(parts[-1]) > 0.5 * _SEARCHED:
                 break
         sights = join(parts)
@@ -197,14 +199,12 @@ class Locator:
     ) -> Solution:
         """Pose from sights whose information counts the uncertain depth of their patches."""
         X, w = _placed(window, sights)
-        covariance = np.linalg.inv(sights.information)
+        sigma = np.zeros(len(sights))
         for index, keyframe in enumerate(window):
-            mine = np.flatnonzero(sights.keyframe == index)
-            if len(mine) == 0:
-                continue
-            take = sights.patch[mine]
-            J_w = reproject(keyframe, T_cw).J_w[take] * keyframe.patches.sigma[take, None]
-            covariance[mine] += J_w[:, :, None] * J_w[:, None, :]
+            mine = sights.keyframe == index
+            sigma[mine] = keyframe.patches.sigma[sights.patch[mine]]
+        along = sights.J_w * sigma[:, None]
+        covariance = np.linalg.inv(sights.information) + along[:, :, None] * along[:, None, :]
         return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, np.linalg.inv(covariance), scales)
 
 
