@@ -24,9 +24,9 @@ class SmallGicp:
         cloud, _ = small_gicp.preprocess_points(points_of(frame), DOWNSAMPLE, num_threads=THREADS)
         if self._started:
             guess = self._T @ self._motion
-            found = small_gicp.align(
-                self._map, cloud, guess, max_correspondence_distance=REACH, num_threads=THREADS
-            ).T_target_source
+            result = small_gicp.align(self._map, cloud, guess, max_correspondence_distance=REACH, num_threads=THREADS)
+            # Products of products: rounding grows without bound where rotations are inverted by transposition.
+            found = se3.orthonormalise(result.T_target_source)
             self._motion, self._T = se3.inverse(self._T) @ found, found
         self._map.insert(cloud, self._T)
         self._started = True

@@ -9,6 +9,7 @@ The sums are compiled; :mod:`.bundle_reference` is the same in numpy.
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from sf_tracking.core.native import intrinsics, native
 MIN_Z = 0.05  # of the unit ray; a patch nearer to the target's image plane or behind it carries no information
 _DAMPING = 1e-4  # first Levenberg-Marquardt damping, relative to the diagonal
 _MAX_DAMPING = 1e4
+_CONVERGED = 1e-4  # of the cost: a step that lowers it by less is the last
 _FLOOR = 1e-9  # of a diagonal: a pose or a depth without any observation stays where it is
 
 
@@ -113,10 +115,39 @@ def _step(linear: Linear, free: NDArray[np.bool_], damping: float) -> tuple[Floa
     return xi.reshape(n, 6), dw.reshape(linear.C.shape)
 
 
+def adjusting(
+    camera: Camera, p: Problem, free: NDArray[np.bool_], scale: float, iterations: int
+) -> Iterator[tuple[Problem, Float64]]:
+    """Levenberg-Marquardt steps that never raise the cost, until they hardly lower it; see :func:`adjust`.
+
+    Yields:
+        After each step what :func:`adjust` returns at last.
+    """
+    damping, now, linear = _DAMPING, cost(camera, p, scale), None
+    for _ in range(iterations):
+        linear = linear or linearise(camera, p, scale)
+        xi, dw = _step(linear, free, damping)
+        # Poses are products of products: without this their rotations drift from orthonormal frame by frame.
+        T_cw = np.where(free[:, None, None], se3.orthonormalise(se3.exp(xi) @ p.T_cw), p.T_cw)
+        trial = replace(p, T_cw=T_cw, w=np.maximum(p.w + dw, 0.0))
+        trial_cost, information = cost(camera, trial, scale), linear.C
+        if trial_cost > now:
+            damping *= 10
+            yield p, information
+            if damping > _MAX_DAMPING:
+                return
+            continue
+        converged = now - trial_cost < _CONVERGED * now
+        p, now, damping, linear = trial, trial_cost, max(damping / 10, 1e-9), None
+        yield p, information
+        if converged:
+            return
+
+
 def adjust(
     camera: Camera, p: Problem, free: NDArray[np.bool_], scale: float, iterations: int
 ) -> tuple[Problem, Float64]:
-    """Optimise the free poses and all inverse depths; Levenberg-Marquardt steps that never raise the cost.
+    """Optimise the free poses and all inverse depths.
 
     Args:
         free: [N] poses to optimise; the others hold the gauge (without measured depth two of them also hold
@@ -127,23 +158,5 @@ def adjust(
         The optimised problem, and the information [N, M] of its inverse depths, 1 / variance given the poses, at the
         last linearisation.
     """
-    damping, now = _DAMPING, cost(camera, p, scale)
-    linear, stale = linearise(camera, p, scale), False
-    for _ in range(iterations):
-        if stale:
-            linear, stale = linearise(camera, p, scale), False
-        xi, dw = _step(linear, free, damping)
-        # Poses are products of products: without this their rotations drift from orthonormal frame by frame.
-        T_cw = np.where(free[:, None, None], se3.orthonormalise(se3.exp(xi) @ p.T_cw), p.T_cw)
-        trial = replace(p, T_cw=T_cw, w=np.maximum(p.w + dw, 0.0))
-        trial_cost = cost(camera, trial, scale)
-        if trial_cost > now:
-            damping *= 10
-            if damping > _MAX_DAMPING:
-                break
-            continue
-        converged = now - trial_cost < 1e-4 * now
-        p, now, damping, stale = trial, trial_cost, max(damping / 10, 1e-9), True
-        if converged:
-            break
-    return p, linear.C
+    *_, last = adjusting(camera, p, free, scale, iterations)
+    return last

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,8 @@ _SEARCHED = 200  # patches searched over levels to find the motion
 _WIDE_SCALES = (20.0, 5.0)  # robust scales of a first guess: right edges must not be rejected far from the truth
 _AGREEING = 0.4  # share of searched patches that must agree before the search counts as done
 _MOST = 0.5  # share of them that must agree on a pose far from the predicted one
-_CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a search needless
+_CERTAIN = (0.6, 0.8)  # shares of patches found, and of those agreeing, that make a second alignment needless
+_LIKELY = (0.5, 0.6)  # the same that make a search needless
 _MOTION = np.diag([0.03**-2] * 3 + [0.02**-2] * 3)  # information of a predicted pose, m and rad
 _HONEST, _PLENTY = 1.5, 80  # excess of errors and number of patches, from which patches alone are trusted
 _FAR = 1e-6  # inverse depth, 1/m, below which a point counts as that far
@@ -36,6 +37,7 @@ class Sights:
     patch: NDArray[np.int64]  # [E] index of the patch in the keyframe
     uv: Float64  # [E, 2] px
     information: Float64  # [E, 2, 2] 1/px^2, of the alignment alone
+    J_w: Float64  # [E, 2] d(uv)/d(inverse depth)
 
     def __len__(self) -> int:
         return len(self.keyframe)
@@ -59,6 +61,10 @@ class Location:
         """Patches err more than they claim, or are few: measured depth has something to add."""
         return self.excess > _HONEST or self.inliers < _PLENTY
 
+    def passes(self, shares: tuple[float, float]) -> bool:
+        """Whether more than these shares of the patches were found, and of those agree."""
+        return self.found > shares[0] and self.inliers > shares[1] * len(self.sights)
+
 
 def blind_location(T_cw: Float64) -> Location:
     """A pose that only the motion model vouches for, within centimetres and a degree."""
@@ -76,14 +82,15 @@ def align_sights(
     """Sights of the patches ``take`` of one keyframe, corrected from their reprojections."""
     update = operator(keyframe.described.take(take), target, at.uv[take], at.warp[take])
     ok = update.valid
-    return Sights(np.full(int(ok.sum()), index), take[ok], update.target[ok], update.information[ok])
+    found = take[ok]
+    return Sights(np.full(len(found), index), found, update.target[ok], update.information[ok], at.J_w[found])
 
 
 def join(parts: Sequence[Sights]) -> Sights:
     """All sights of several keyframes."""
-    none = Sights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)))
+    none = Sights(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros((0, 2)))
     parts = parts or [none]
-    return Sights(*(np.concatenate([getattr(p, n) for p in parts]) for n in ("keyframe", "patch", "uv", "information")))
+    return Sights(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Sights)))
 
 
 class Locator:
@@ -100,13 +107,17 @@ class Locator:
 
         A smooth motion is predicted well enough to align at once; else the search over levels comes first.
         """
-        at_once = None if wide else self.align(window, view, predicted)
-        if at_once is not None and at_once.found > _CERTAIN[0] and at_once.inliers > _CERTAIN[1] * len(at_once.sights):
-            return at_once
+        near = None if wide else self.align(window, view, predicted)
+        if near is not None and not near.passes(_CERTAIN):
+            # Nearer to the truth more patches lie within the reach of alignment.
+            again = self.align(window, view, near.T_cw)
+            near = again if again is not None and again.support > near.support else near
+        if near is not None and near.passes(_LIKELY):
+            return near
         T_cw = self._search(window, view, predicted, wide)
         searched = None if T_cw is None else self.align(window, view, T_cw)
         # Where much of the image moves on its own, the search may follow it; most patches decide.
-        return max((f for f in (at_once, searched) if f is not None), key=lambda f: f.support, default=None)
+        return max((f for f in (near, searched) if f is not None), key=lambda f: f.support, default=None)
 
     def _search(self, window: Sequence[TrackedKeyframe], view: View, predicted: Float64, wide: bool) -> Float64 | None:
         """A first pose from the newest keyframes' patches, found over the levels of the pyramid."""
@@ -119,7 +130,7 @@ class Locator:
             uv, ok = search(self._config, keyframe.view, keyframe.patches.uv[take], view, start, wide=wide)
             tried += len(take)
             sigma = np.broadcast_to(np.eye(2) / _SEARCH_SIGMA**2, (int(ok.sum()), 2, 2))
-            parts.append(Sights(np.full(int(ok.sum()), index), take[ok], uv[ok], sigma))
+            parts.append(Sights(np.full(int(ok.sum()), index), take[ok], uv[ok], sigma, at.J_w[take[ok]]))
             if len(parts[-1]) > 0.5 * _SEARCHED:
                 break
         sights = join(parts)
@@ -188,14 +199,12 @@ class Locator:
     ) -> Solution:
         """Pose from sights whose information counts the uncertain depth of their patches."""
         X, w = _placed(window, sights)
-        covariance = np.linalg.inv(sights.information)
+        sigma = np.zeros(len(sights))
         for index, keyframe in enumerate(window):
-            mine = np.flatnonzero(sights.keyframe == index)
-            if len(mine) == 0:
-                continue
-            take = sights.patch[mine]
-            J_w = reproject(keyframe, T_cw).J_w[take] * keyframe.patches.sigma[take, None]
-            covariance[mine] += J_w[:, :, None] * J_w[:, None, :]
+            mine = sights.keyframe == index
+            sigma[mine] = keyframe.patches.sigma[sights.patch[mine]]
+        along = sights.J_w * sigma[:, None]
+        covariance = np.linalg.inv(sights.information) + along[:, :, None] * along[:, None, :]
         return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, np.linalg.inv(covariance), scales)
 
 

@@ -148,7 +148,9 @@ def measure(frame: Frame, uv: Float64, config: TrackingConfig) -> Measured:
         broken |= np.abs(slope).max(axis=1) > _GRAZING * w0
     enough = (known.mean(axis=1) >= _KNOWN_SHARE) & (w0 > 1.0 / config.max_depth)
     # A smooth sensor earns trust, but never beyond a part of its model: offsets do not show in the residual.
-    sigma = np.hypot(0.25 * model, rough)
+    # Where the surface is inclined, depth that lies beside its pixel is another's.
+    beside = config.registration_px * np.linalg.norm(slope, axis=1)
+    sigma = np.sqrt((0.25 * model) ** 2 + rough**2 + beside**2)
     w0 = np.where(enough, w0, np.nan)
     return Measured(w0, np.where(enough, sigma, np.nan), np.where(enough[:, None], slope, 0.0), broken & enough)
 

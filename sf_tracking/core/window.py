@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import Problem, adjust, information_root
+from sf_tracking.core.bundle import Problem, adjusting, information_root
 from sf_tracking.core.keyframes import TrackedKeyframe, reproject
 from sf_tracking.core.locate import Location, align_sights
 from sf_tracking.core.patches import Measured, Patches, extract
@@ -21,8 +21,7 @@ from sf_tracking.core.update import UpdateOperator, View, search
 _GUESS = 0.5  # relative deviation of an inverse depth that is only expected from its neighbours
 _NEIGHBOURS = 5  # known patches whose median a new patch without depth starts from
 _KNOWN = 0.3  # relative deviation up to which a patch counts as known
-_AT_ONCE = 4  # keyframes in which a new one's patches are looked for per frame
-_STEPS_AT_ONCE = 1  # of bundle adjustment per frame
+_AT_ONCE = 2  # keyframes in which a new one's patches are looked for per part of the work
 _DONE = object()
 _RANGE = (1e-3, 50.0)  # of the median inverse depth, within which refined ones are kept
 
@@ -36,6 +35,8 @@ class Window:
         self.keyframes: list[TrackedKeyframe] = []
         self._parts: Iterator[None] = iter(())
         self._idle = True
+        self._calls = 0  # of work() since the newest keyframe
+        self._pace = 1  # parts per call
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -95,21 +96,28 @@ class Window:
             mine = sights.keyframe == index
             _remember(source, stamp, sights.patch[mine], sights.uv[mine], sights.information[mine])
         self.keyframes.append(keyframe)
+        steps = iterations or self._config.bundle_iterations
+        parts = -(-(len(self.keyframes) - 1) // _AT_ONCE) + 1 + steps
+        # As many frames as lay between the last two keyframes will hardly be fewer before the next.
+        self._pace, self._calls = -(-parts // max(1, self._calls)), 0
         self._idle = False
-        self._parts = self._integrate(keyframe, found, fixed, iterations or self._config.bundle_iterations)
+        self._parts = self._integrate(keyframe, found, fixed, steps)
 
     def work(self) -> bool:
-        """Do the next part of a new keyframe's work; True when nothing is left.
+        """Do the next parts of a new keyframe's work; True when nothing is left.
 
-        The parts go to the frames that follow a keyframe, so that it takes hardly longer than any other.
+        The parts go evenly to the frames that follow a keyframe, so that none takes much longer than another.
         """
-        self._idle = next(self._parts, _DONE) is _DONE
+        self._calls += 1
+        for _ in range(self._pace):
+            self._idle = next(self._parts, _DONE) is _DONE
         return self._idle
 
     def complete(self) -> None:
         """Do all that is left."""
-        while not self.work():
+        for _ in self._parts:
             pass
+        self._idle = True
 
     def _integrate(self, keyframe: TrackedKeyframe, found: Location, fixed: int, iterations: int) -> Iterator[None]:
         """Look for the patches of a new keyframe in the window, align its surface, adjust the bundle."""
@@ -121,9 +129,7 @@ class Window:
         if found.doubtful and self._config.shape_trust and others:
             self._align_shapes(keyframe, others[-self._config.shape_keyframes :])
             yield
-        for done in range(0, iterations, _STEPS_AT_ONCE):
-            self.optimise(fixed, min(_STEPS_AT_ONCE, iterations - done))
-            yield
+        yield from self._optimise(fixed, iterations)
 
     def _align_shapes(self, keyframe: TrackedKeyframe, others: list[TrackedKeyframe]) -> None:
         """Relative motions of a keyframe from its measured surface and those of others."""
@@ -150,15 +156,18 @@ class Window:
         sights = align_sights(self._operator, target.view, 0, source, at, take)
         _remember(source, target.frame.stamp_ns, sights.patch, sights.uv, sights.information / excess)
 
-    def optimise(self, fixed: int, iterations: int) -> None:
-        """Bundle adjustment of the window; the ``fixed`` oldest keyframes hold the gauge."""
+    def _optimise(self, fixed: int, iterations: int) -> Iterator[None]:
+        """Bundle adjustment of the window, step by step; the ``fixed`` oldest keyframes hold the gauge."""
         keyframes = self.keyframes
-        problem = self._problem()
         free = np.arange(len(keyframes)) >= min(fixed, len(keyframes) - 1)
-        c = self._config
-        solved, information = adjust(
-            keyframes[0].camera, problem, free, c.robust_sigmas, iterations or c.bundle_iterations
-        )
+        steps = adjusting(keyframes[0].camera, self._problem(), free, self._config.robust_sigmas, iterations)
+        for solved, information in steps:
+            self._store(solved, information)
+            yield
+
+    def _store(self, solved: Problem, information: Float64) -> None:
+        """Poses and inverse depths of an adjusted problem."""
+        keyframes = self.keyframes
         known = np.concatenate([k.patches.w for k in keyframes])
         low, high = np.median(known) * _RANGE[0], np.median(known) * _RANGE[1]
         for i, keyframe in enumerate(keyframes):

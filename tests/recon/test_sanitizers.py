@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-KERNELS = ("color_decoder", "ipr_bins", "ipr_cpu", "point_grid", "rows", "view_blend")
+KERNELS = {
+    "recon": ("color_decoder", "ipr_bins", "ipr_cpu", "point_grid", "rows", "view_blend"),
+    "tracking": ("align", "bundle", "pose", "surface"),
+}
 # Run-time choice of vectors is off: it picks the function before the sanitizer has started.
 FLAGS = [
     "-std=c++17",
@@ -27,10 +30,11 @@ SANITIZERS = ["-fsanitize=address,undefined,float-cast-overflow", "-fno-sanitize
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no g++")
-def test_hostile_input_under_the_sanitizers(tmp_path: Path) -> None:
-    csrc, program = ROOT / "sf_recon" / "csrc", tmp_path / "kernels_test"
-    sources = [str(ROOT / "tests" / "recon" / "csrc" / "kernels_test.cpp")]
-    sources += [str(csrc / f"{name}.cpp") for name in KERNELS]
+@pytest.mark.parametrize("block", KERNELS)
+def test_hostile_input_under_the_sanitizers(block: str, tmp_path: Path) -> None:
+    csrc, program = ROOT / f"sf_{block}" / "csrc", tmp_path / "kernels_test"
+    sources = [str(ROOT / "tests" / block / "csrc" / "kernels_test.cpp")]
+    sources += [str(csrc / f"{name}.cpp") for name in KERNELS[block]]
     build = ["g++", *FLAGS, *SANITIZERS, f"-I{csrc}", *sources, "-o", str(program)]
     subprocess.run(build, check=True, capture_output=True, text=True)
     run = subprocess.run([str(program)], capture_output=True, text=True, check=False)

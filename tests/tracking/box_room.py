@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from sf_bringup.simulate.sensors import LIDARS, ray_pattern
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, DepthMap, Float64, Frame, SparseDepth
 
@@ -65,7 +66,7 @@ class BoxRoom:
         return image.round().astype(np.uint8), z
 
     def frame(self, index: int, T_wc: Float64, kind: str = "sparse", gain: float = 1.0) -> Frame:
-        """The frame of one pose; ``kind`` is dense, sparse or none."""
+        """The frame of one pose; ``kind`` is dense, sparse, rosette or none."""
         gray, z = self.view(T_wc)
         image = np.repeat(np.clip(gray * gain, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
         stamp = 1_000_000_000 + index * STEP_NS
@@ -74,9 +75,18 @@ class BoxRoom:
         if kind == "none":
             return Frame(stamp, CAMERA, image)
         uv = self._rng.uniform((1, 1), (CAMERA.width - 1, CAMERA.height - 1), (4000, 2))
+        if kind == "rosette":
+            uv = _rosette(index)
         col, row = np.floor(uv).astype(int).T
         centres = np.stack([col, row], axis=-1) + 0.5
         return Frame(stamp, CAMERA, image, sparse_depth=SparseDepth(centres, z[row, col]))
+
+
+def _rosette(sweep: int) -> Float64:
+    """Where a sweep of a scanner that draws a rosette, mounted in the camera, meets the image, [N, 2] px."""
+    forward, left, up = ray_pattern(LIDARS["rosette"], sweep, STEP_NS * 1e-9, 360.0)[0].T
+    uv = np.stack([CAMERA.cx - CAMERA.fx * left / forward, CAMERA.cy - CAMERA.fy * up / forward], axis=-1)
+    return uv[((uv > 0) & (uv < (CAMERA.width, CAMERA.height))).all(axis=1)]
 
 
 def path(count: int, step: float = 0.03) -> Float64:

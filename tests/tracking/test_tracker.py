@@ -11,7 +11,7 @@ import pytest
 from sf_bringup.evaluation import trajectory_error
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Frame, Trajectory
+from sf_interfaces.types import Frame, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.patches import extract, to_gray
 from sf_tracking.core.tracker import Tracker, TrackingState
@@ -96,6 +96,19 @@ def test_frames_without_depth_are_tracked_against_what_is_known() -> None:
     tracker.finish()
     truth = Trajectory(np.array([f.stamp_ns for f in frames]), poses)
     assert trajectory_error(tracker.trajectory(), truth).rmse < 0.015
+
+
+@pytest.mark.parametrize("missing", [(), (5, 9, 10, 11, 16)])
+def test_a_rosette_scanner_is_tracked_and_keeps_its_scale_where_sweeps_are_missing(missing: tuple[int, ...]) -> None:
+    room, poses = BoxRoom(3), path(20)
+    tracker = Tracker(CONFIG)
+    for i, T in enumerate(poses):
+        frame = room.frame(i, T, "none" if i in missing else "rosette")
+        update = tracker.track(frame)
+        assert update.T_map_camera is not None and update.scale is Scale.METRIC
+    tracker.finish()
+    truth = Trajectory(tracker.trajectory().stamps_ns, poses)
+    assert trajectory_error(tracker.trajectory(), truth).rmse < 0.005  # m, without alignment of scale
 
 
 def test_bars_that_repeat_do_not_pull_a_turn_to_another_bar() -> None:
