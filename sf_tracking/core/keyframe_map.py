@@ -27,7 +27,8 @@ _ODOMETRY_STRETCH, _LOOP_STRETCH = 0.005, 0.02  # and its unit, and that of a lo
 _NEWS = 3.0  # deviations from which on a loop tells anything that the map does not know
 _SAME_PLACE = (0.04, 0.04, 0.15)  # two sightings agree: share of the depth, rad, log of scale
 _WITHIN = 3  # keyframes after the first sighting in which a second one has to confirm it
-_PLAUSIBLE = {Scale.METRIC: 0.05, Scale.ARBITRARY: 0.25}  # drift per path that a loop may ask for
+_PLAUSIBLE = {Scale.METRIC: 0.02, Scale.ARBITRARY: 0.25}  # drift per path that a loop may ask for
+_LOOP_INLIERS = 50  # corners that agree: a bay that merely looks alike has fewer, a known one some hundred
 _TURN, _STRETCH = 0.35, 0.7  # rad and log of scale that it may ask for
 
 
@@ -183,7 +184,9 @@ class KeyframeMap:
         return best if all(self.agree(best.S, other.S, depth) for other in found) else None
 
     def _plausible(self, loop: Recognised, n: int) -> bool:
-        """A loop may only ask for as much drift as the way since then explains."""
+        """A loop needs many corners, and may only ask for as much drift as the way since then explains."""
+        if loop.inliers < _LOOP_INLIERS:
+            return False
         r, _ = sim3.coordinates(sim3.inverse(self.S[n]) @ loop.S)
         way = self._walked[n] - self._walked[loop.index]
         most = _PLAUSIBLE[self.scale] * way + 0.1 * self.places[n].depth

@@ -39,8 +39,8 @@ def distance(T: np.ndarray | None, truth: np.ndarray) -> float:
 
 
 def test_a_loop_takes_back_what_wrong_depth_made_drift() -> None:
-    poses = circle(LAP + 24, LAP, RADIUS)
-    given = warming_up(frames(poses), 18, 54)
+    lap = 48
+    given = warming_up(frames(circle(lap + 16, lap, RADIUS)), 12, 36)
     session, plain = TrackingSession(CONFIG), TrackingSession(replace(CONFIG, loops=False))
     jumps, odometry = [], []
     for frame in given:
@@ -52,7 +52,7 @@ def test_a_loop_takes_back_what_wrong_depth_made_drift() -> None:
     session.finish()
     plain.finish()
     gap, plain_gap = (
-        np.linalg.norm(t.positions[LAP : LAP + 20] - t.positions[:20], axis=1).mean()
+        np.linalg.norm(t.positions[lap : lap + 14] - t.positions[:14], axis=1).mean()
         for t in (session.trajectory(), plain.trajectory())
     )
     assert plain_gap > 0.05 and gap < 0.25 * plain_gap
@@ -85,7 +85,7 @@ def test_a_lost_camera_goes_on_where_it_knows_a_place(kind: str) -> None:
         else np.ptp(list(known.values()), axis=0).max()
     )
     for k in found:
-        assert distance(after[k].T_map_camera, known[given[6 + k].stamp_ns]) < 0.02 * size
+        assert distance(after[k].T_map_camera, known[given[6 + k].stamp_ns]) < 0.03 * size
     assert after[-1].scale is (Scale.METRIC if kind != "none" else Scale.ARBITRARY)
     stamps = {keyframe.stamp_ns for update in (*before, *after, session.finish()) for keyframe in update.keyframes}
     assert any(stamp > dark[-1].stamp_ns for stamp in stamps), "the map goes on"
