@@ -15,6 +15,7 @@ from sf_tracking.config import TrackingConfig
 
 _PLANE_HALF = 4  # px, half side of the window of dense depth to which a plane is fitted
 _PLANE_NEIGHBOURS = 12  # points of sparse depth to which a plane is fitted
+_SPACING = 3.0  # px, side of the cells of which each gives one of them
 _KNOWN_SHARE = 0.5  # of the window that must carry depth
 _GRAZING = 0.04  # relative change of depth per px, above which a surface is seen too flat to be measured
 _SPARES = 1.6  # candidates per wanted patch, since some fail the test of their depth
@@ -115,8 +116,12 @@ def _neighbourhood(frame: Frame, uv: Float64) -> tuple[Float64, Float64]:
     """Offsets [C, K, 2] px and inverse depths [C, K] (NaN: none) of the measured depths round each place."""
     sparse = frame.sparse_depth
     if sparse is not None:
-        near = cKDTree(sparse.uv).query(uv, k=min(_PLANE_NEIGHBOURS, len(sparse)))[1].reshape(len(uv), -1)
-        return sparse.uv[near] - uv[:, None], 1.0 / sparse.z[near]
+        # A scanner's stroke is dense along its way: its next points would lie on a line and leave the plane open.
+        cell = np.floor(sparse.uv / _SPACING).astype(np.int64) @ (1, 1 << 32)
+        apart = np.unique(cell, return_index=True)[1]
+        at, w = sparse.uv[apart], 1.0 / sparse.z[apart]
+        near = cKDTree(at).query(uv, k=min(_PLANE_NEIGHBOURS, len(at)))[1].reshape(len(uv), -1)
+        return at[near] - uv[:, None], w[near]
     assert frame.depth is not None
     dv, du = (g.ravel() for g in np.mgrid[-_PLANE_HALF : _PLANE_HALF + 1, -_PLANE_HALF : _PLANE_HALF + 1])
     col, row = np.floor(uv).astype(np.int64).T

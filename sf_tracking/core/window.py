@@ -98,8 +98,8 @@ class Window:
         self.keyframes.append(keyframe)
         steps = iterations or self._config.bundle_iterations
         parts = -(-(len(self.keyframes) - 1) // _AT_ONCE) + 1 + steps
-        # As many frames as lay between the last two keyframes will hardly be fewer before the next.
-        self._pace, self._calls = -(-parts // max(1, self._calls)), 0
+        # As many frames as lay between the last two keyframes lie before the next, which has work enough of its own.
+        self._pace, self._calls = -(-parts // max(1, self._calls - 1)), 0
         self._idle = False
         self._parts = self._integrate(keyframe, found, fixed, steps)
 

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <limits>
 
 #include "linear.hpp"
@@ -18,20 +19,30 @@ constexpr int kPixels = (kMaxSide + 2) * (kMaxSide + 2), kRoom = kPixels + 8;
 // Bilinear grey levels less 128 at count continuous pixels; the border repeats outside. Rooms of eight are filled.
 SF_INLINE void sample(const Image& image, const float* u, const float* v, int count, float* values) {
     const float last_u = static_cast<float>(image.width - 1), last_v = static_cast<float>(image.height - 1);
+    const int right = image.width > 1, down = image.height > 1 ? image.width : 0;
+    const Int8 last_col = Int8{} + std::max(image.width - 2, 0), last_row = Int8{} + std::max(image.height - 2, 0);
     for (int k = 0; k < count; k += 8) {
         Float8 x = load8(u + k) - 0.5f, y = load8(v + k) - 0.5f;
         x = x > 0.0f ? x : Float8{};  // NaN becomes 0
         y = y > 0.0f ? y : Float8{};
         x = x < last_u ? x : Float8{} + last_u;
         y = y < last_v ? y : Float8{} + last_v;
-        const Int8 col = __builtin_convertvector(x, Int8), row = __builtin_convertvector(y, Int8);
+        Int8 col = __builtin_convertvector(x, Int8), row = __builtin_convertvector(y, Int8);
+        col = col < last_col ? col : last_col;
+        row = row < last_row ? row : last_row;
         const Float8 fx = x - __builtin_convertvector(col, Float8), fy = y - __builtin_convertvector(row, Float8);
-        Float8 a, b, c, d;
+        int32_t at[8];
+        const Int8 index = row * image.width + col;
+        std::memcpy(at, &index, sizeof(at));
+        float corner[4][8];
         for (int i = 0; i < 8; ++i) {
-            const int right = col[i] + 1 < image.width, down = row[i] + 1 < image.height ? image.width : 0;
-            const float* at = image.grey + static_cast<size_t>(row[i]) * image.width + col[i];
-            a[i] = at[0], b[i] = at[right], c[i] = at[down], d[i] = at[down + right];
+            const float* grey = image.grey + at[i];
+            corner[0][i] = grey[0];
+            corner[1][i] = grey[right];
+            corner[2][i] = grey[down];
+            corner[3][i] = grey[down + right];
         }
+        const Float8 a = load8(corner[0]), b = load8(corner[1]), c = load8(corner[2]), d = load8(corner[3]);
         const Float8 top = a + fx * (b - a), bottom = c + fx * (d - c);
         store8(values + k) = top + fy * (bottom - top) - kGrey;
     }

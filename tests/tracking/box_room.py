@@ -79,7 +79,8 @@ class BoxRoom:
             uv = _rosette(index)
         col, row = np.floor(uv).astype(int).T
         centres = np.stack([col, row], axis=-1) + 0.5
-        return Frame(stamp, CAMERA, image, sparse_depth=SparseDepth(centres, z[row, col]))
+        noise = self._rng.normal(0, 0.015, len(uv)) if kind == "rosette" else 0.0  # m
+        return Frame(stamp, CAMERA, image, sparse_depth=SparseDepth(centres, z[row, col] + noise))
 
 
 def _rosette(sweep: int) -> Float64:

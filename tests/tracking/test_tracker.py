@@ -11,9 +11,9 @@ import pytest
 from sf_bringup.evaluation import trajectory_error
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Frame, Scale, Trajectory
+from sf_interfaces.types import Frame, Scale, SparseDepth, Trajectory
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.patches import extract, to_gray
+from sf_tracking.core.patches import extract, measure, to_gray
 from sf_tracking.core.tracker import Tracker, TrackingState
 from tests.tracking.box_room import CAMERA, BoxRoom, barred, path
 
@@ -109,6 +109,18 @@ def test_a_rosette_scanner_is_tracked_and_keeps_its_scale_where_sweeps_are_missi
     tracker.finish()
     truth = Trajectory(tracker.trajectory().stamps_ns, poses)
     assert trajectory_error(tracker.trajectory(), truth).rmse < 0.005  # m, without alignment of scale
+
+
+def test_the_dense_stroke_of_a_scanner_does_not_tilt_the_surface() -> None:
+    """Points a tenth of a pixel apart on lines six pixels apart: the nearest ones of a place lie on one line."""
+    rng = np.random.default_rng(0)
+    u, v = np.meshgrid(np.arange(5.0, 315.0, 0.1), np.arange(5.0, 235.0, 6.0))
+    uv = np.stack([u.ravel(), v.ravel()], axis=-1)
+    scan = SparseDepth(uv, 3.0 + rng.normal(0, 0.015, len(uv)))
+    frame = Frame(0, CAMERA, np.zeros((240, 320), np.uint8), sparse_depth=scan)
+    found = measure(frame, rng.uniform(30, 200, (50, 2)), TrackingConfig())
+    assert (np.abs(found.slope).max(axis=1) < 0.02 * found.w).all()  # of the inverse depth, per px
+    np.testing.assert_allclose(found.w, 1 / 3, rtol=0.02)
 
 
 def test_bars_that_repeat_do_not_pull_a_turn_to_another_bar() -> None:
