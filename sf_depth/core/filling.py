@@ -11,13 +11,13 @@ import numpy as np
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.monodepth import MonoDepth, load_monodepth
-from sf_interfaces.types import DepthMap, Float32, Keyframe
+from sf_interfaces.types import DepthMap, Float32, Float64, Keyframe
 
 # Relative deviation for every image width of distance from triangulated depth: another surface may be there,
 # which no interpolation of what was seen can know. What poses and calibration get wrong around a gap they get wrong
 # in it, too: the relative variance of the nearest triangulated pixel is added.
 _UNSEEN = 1.0
-_FIRST_WINDOW, _WINDOWS = 4.0, 6  # px, half the side of the smallest window; each of the others is twice as wide
+_LEAST_WINDOW = 4.0  # px, half the side of the smallest window that surfaces are compared in
 
 
 class Filler:
@@ -67,18 +67,24 @@ def _nearest(valid: np.ndarray) -> tuple[Float32, tuple[np.ndarray, np.ndarray]]
 
 
 def _disagreement(z: Float32, away: Float32) -> Float32:
-    """Variance [H, W] of the log depth seen around every pixel, in a window of twice its distance [H, W] px to it.
+    """Variance [H, W] of the log depth seen around each gap's pixel, up to twice its distance [H, W] px from it.
 
-    What a gap hides belongs to one of the surfaces around it, and which one is a guess.
+    What a gap hides belongs to one of the surfaces around it, and which one is a guess. 0 where depth is seen.
     """
-    seen = np.isfinite(z).astype(np.float32)
-    log = np.log(np.where(seen > 0, z, 1.0)).astype(np.float32)
-    level = np.clip(np.log2(2.0 * np.maximum(away, 1.0) / _FIRST_WINDOW), 0, _WINDOWS - 1)
-    out = np.zeros_like(log)
-    for k in range(_WINDOWS):
-        side = int(2 * _FIRST_WINDOW * 2**k) + 1
-        count, first, second = (cv2.blur(part, (side, side)) for part in (seen, seen * log, seen * log * log))
-        mean = first / np.maximum(count, 1e-6)
-        own = np.maximum(second / np.maximum(count, 1e-6) - mean * mean, 0.0)
-        out += np.maximum(1.0 - np.abs(level - k), 0.0).astype(np.float32) * own
+    seen = np.isfinite(z)
+    log = np.log(np.where(seen, z, 1.0)).astype(np.float64)
+    row, col = np.nonzero(~seen)
+    half = np.maximum(2.0 * away[row, col], _LEAST_WINDOW).astype(np.int64)
+    top, left = np.maximum(row - half, 0), np.maximum(col - half, 0)
+    bottom, right = np.minimum(row + half + 1, z.shape[0]), np.minimum(col + half + 1, z.shape[1])
+
+    def around(values: np.ndarray) -> Float64:
+        """Sum over the window of every pixel, [G]."""
+        total = cv2.integral(values, sdepth=cv2.CV_64F)
+        return np.asarray(total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left])
+
+    count = np.maximum(around(seen.astype(np.float64)), 1.0)
+    mean = around(log) / count
+    out = np.zeros(z.shape, np.float32)
+    out[row, col] = np.maximum(around(log * log) / count - mean * mean, 0.0)
     return out

@@ -17,7 +17,6 @@ _TRUST = 3.0  # a plane is extended this many spacings of its observations
 _CLIP = 1.3  # and changes by this factor at most
 _AGREE = 0.03  # relative deviation of planes that belong to one surface
 _SUSPECT = 1.0  # log distance behind its surroundings at which an observation counts half
-_UNSURE = 0.03  # relative deviation at which an observation counts half
 _SAMPLES = (0.25, 0.5, 0.75)  # where the colour is looked up between a pixel and an observation
 _BARRIER = 0.7  # how much a colour step in between counts against one at the ends
 _SOFT = 0.25  # share of the spacing below which all observations are equally near
@@ -101,7 +100,7 @@ def reliability(observed: Observations, color: torch.Tensor) -> tuple[torch.Tens
     seen = look(observed, observed.near, x, color)
     around = _median(seen.value, seen.affinity / (seen.square + 1e-3))[:, 0]
     behind = torch.log(around / observed.ratio).clamp_min(0.0) / _SUSPECT
-    weight = 1.0 / ((1.0 + behind * behind) * (1.0 + observed.noise / _UNSURE**2))
+    weight = 1.0 / (1.0 + behind * behind)
     ids = torch.cat([torch.arange(len(observed.ratio))[:, None], observed.near], dim=1)
     seen = look(observed, ids, x, color)
     trust = seen.affinity * weight[ids][..., None]
