@@ -1,7 +1,8 @@
 """Sets of images with the truth about them: simulated ones with exact depth, real ones with what reference they bring.
 
-Options of the depth block are chosen on simulated sets of other places and, of 7-Scenes, on frames 0-99 only: the sets
-here use frames 100-199.
+Of 7-Scenes, options of the depth block were chosen on frames 0-99 only; the sets here use frames 100-199. The simulated
+sets (but for the Ames room) were looked at for those choices too: their rows show what the block can do, not how it
+fares elsewhere.
 """
 
 # SPDX-License-Identifier: Apache-2.0
