@@ -59,6 +59,8 @@ def sample(image: Float32, pixels: Float64) -> Float32:
     """Bilinear samples [E, P] at continuous pixels [E, P, 2]; the border repeats outside."""
     at = pixels.astype(np.float32) - np.float32(0.5)
     u, v = np.ascontiguousarray(at[..., 0]), np.ascontiguousarray(at[..., 1])
+    if not u.size:
+        return np.zeros(u.shape, np.float32)
     return np.asarray(cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
