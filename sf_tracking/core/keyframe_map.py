@@ -26,7 +26,7 @@ _ODOMETRY_PX = 0.5  # what a relative pose between neighbours errs by, as displa
 _ODOMETRY_STRETCH, _LOOP_STRETCH = 0.005, 0.02  # and its unit, and that of a loop
 _NEWS = 3.0  # deviations from which on a loop tells anything that the map does not know
 _SAME_PLACE = (0.04, 0.04, 0.15)  # two sightings agree: share of the depth, rad, log of scale
-_WITHIN = 3  # keyframes after the first sighting in which a second one has to confirm it
+_SIGHTINGS, _WITHIN = 3, 3  # so many keyframes have to agree on a loop, each so soon after the one before
 _PLAUSIBLE = {Scale.METRIC: 0.02, Scale.ARBITRARY: 0.25}  # drift per path that a loop may ask for
 _LOOP_INLIERS = 50  # corners that agree: a bay that merely looks alike has fewer, a known one some hundred
 _TURN, _STRETCH = 0.35, 0.7  # rad and log of scale that it may ask for
@@ -66,8 +66,7 @@ class KeyframeMap:
         self._index = Index()
         self._walked: list[float] = []  # length of the path up to each keyframe
         self._parts: Iterator[None] = iter(())
-        self._hint: Recognised | None = None  # a loop that waits for a second sighting
-        self._hinted = 0  # keyframe that saw it
+        self._hints: list[tuple[Recognised, int]] = []  # sightings that agree so far, and the keyframes that had them
         self._news = False
 
     def __len__(self) -> int:
@@ -108,7 +107,7 @@ class KeyframeMap:
         """
         if not self._news:
             return None
-        self._news, self._hint = False, None
+        self._news, self._hints = False, []
         before = self.S
         self.S, _ = optimise(before, self._graph(), with_scale=self.scale is Scale.ARBITRARY)
         return self.S @ sim3.inverse(before)
@@ -193,21 +192,22 @@ class KeyframeMap:
         return bool(np.linalg.norm(r[:3]) < most and np.linalg.norm(r[3:6]) < _TURN and np.abs(r[6]) < _STRETCH)
 
     def _consider(self, loop: Recognised, n: int) -> None:
-        """Take a loop that tells something new, once a second sighting has confirmed it."""
-        place = self.places[n]
-        Z = sim3.inverse(self.S[loop.index]) @ loop.S
-        r, _ = sim3.coordinates(sim3.inverse(Z) @ sim3.inverse(self.S[loop.index]) @ self.S[n])
+        """Take a loop that tells something new, once enough keyframes in a row agree on it."""
+        r, _ = sim3.coordinates(sim3.inverse(loop.S) @ self.S[n])
         if np.abs(r / loop.sigma).max() < _NEWS:
-            self._hint = None
+            self._hints = []
             return
-        hint = self._hint if n - self._hinted <= _WITHIN else None
-        if hint is not None:
-            expected = hint.S @ sim3.inverse(self.S[self._hinted]) @ self.S[n]
-            if self.agree(expected, loop.S, place.depth * float(sim3.scale_of(loop.S))):
-                for seen, at in ((hint, self._hinted), (loop, n)):
-                    self._tie(seen.index, at, seen.S, seen.sigma, loop=True)
-                self._news = True
-        self._hint, self._hinted = loop, n
+        if self._hints:
+            last, at = self._hints[-1]
+            expected = last.S @ sim3.inverse(self.S[at]) @ self.S[n]
+            depth = self.places[n].depth * float(sim3.scale_of(loop.S))
+            if n - at > _WITHIN or not self.agree(expected, loop.S, depth):
+                self._hints = []
+        self._hints.append((loop, n))
+        if len(self._hints) >= _SIGHTINGS:
+            for seen, at in self._hints:
+                self._tie(seen.index, at, seen.S, seen.sigma, loop=True)
+            self._news, self._hints = True, []
 
     # ---- the graph
 
