@@ -65,8 +65,12 @@ def test_configuration_sections_become_parameters() -> None:
 def test_lines_that_cannot_run_are_refused() -> None:
     with pytest.raises(PlanError, match="an image set is estimated at once"):
         line({Q.IMAGE, Q.INTRINSICS}, {}, "mvd")
-    with pytest.raises(PlanError, match="in one process"):
-        line({Q.IMAGE, Q.INTRINSICS, Q.SPARSE_DEPTH}, {"lidar": "/points"}, "completion")
+
+
+def test_single_frames_are_completed_without_a_pose() -> None:
+    made = line({Q.IMAGE, Q.INTRINSICS, Q.SPARSE_DEPTH}, {"rgb": "/image", "lidar": "/points"}, "completion")
+    assert [launch.name for launch in made] == ["depth"] and made[0].head
+    assert made[0].parameters["sync.lidar"] and not made[0].parameters["sync.pose"]
 
 
 def test_colour_depth_and_lidar_find_their_roles() -> None:
