@@ -68,9 +68,9 @@ def test_lines_that_cannot_run_are_refused() -> None:
 
 
 def test_single_frames_are_completed_without_a_pose() -> None:
-    made = line({Q.IMAGE, Q.INTRINSICS, Q.SPARSE_DEPTH}, {"rgb": "/image", "lidar": "/points"}, "completion")
-    assert [launch.name for launch in made] == ["depth"] and made[0].head
-    assert made[0].parameters["sync.lidar"] and not made[0].parameters["sync.pose"]
+    nodes = line({Q.IMAGE, Q.INTRINSICS, Q.SPARSE_DEPTH}, {"lidar": "/points"}, "completion")
+    assert list(nodes) == ["depth"] and nodes["depth"].head
+    assert nodes["depth"].parameters["sync.lidar"] and not nodes["depth"].parameters["sync.pose"]
 
 
 def test_colour_depth_and_lidar_find_their_roles() -> None:
