@@ -28,6 +28,10 @@ FOLDER = {
     "depth": (["--line", "room0"], ["--all", "--oracle", "--line", *_ROOMS, "hall"]),
     "live_map": ([], []),
     "map_memory": (["--keyframes", "12"], ["--keyframes", "100"]),
+    "loops": (
+        ["--walks", "room-rgbd", "room-mono", "--factor", "0.25", "--lost"],
+        ["--lost", "--memory", "10000"],
+    ),
     "scales": ([], ["--frames", "400", "--factor", "1"]),
     "real": ([], ["--frames", "1000"]),
 }
