@@ -159,9 +159,9 @@ def result(row: dict[str, Any]) -> str:
 
 PREFACE = """# Every line, in both engines, on simulated and real data
 
-Made by `python benchmarks/lines.py --data FOLDER --markdown docs/lines.md`: each bag below `out/lines` holds nothing but
-the inputs of its line (and the references), so the blocks are derived from the topics alone. The recon block learns
-little here (8 steps a keyframe): the table is about lines, not about quality. "Engines differ by" is the largest
+Made by `python benchmarks/lines.py --data FOLDER --markdown docs/lines.md`: each bag below `out/lines` holds nothing
+but the inputs of its line (and the references), so the blocks are derived from the topics alone. Recon learns little
+here (8 steps a keyframe): the table is about lines, not about quality. "Engines differ by" is the largest
 distance between what the two engines estimated: positions, else points of the surface, else depth. What is not
 offered says so in its row.
 """
