@@ -22,7 +22,7 @@ from sf_interfaces.types import DepthMap, Frame, Keyframe, PointCloud, UInt8
 MVD = "depth:mvd"
 _TILE_WIDTH = 320  # px of the contact sheet
 _CLOUD_POINTS = 2_000_000  # of surface.ply at most
-_SURE = 0.05  # relative deviation beyond which a pixel is left out of the cloud
+_SURE = 0.05  # relative deviation beyond which a pixel is left out of the cloud, unless half of its image is no surer
 
 
 def is_photo_set(made: Plan) -> bool:
@@ -63,7 +63,9 @@ def cloud(keyframes: Sequence[Keyframe]) -> PointCloud:
         keep &= depth.valid
         if depth.variance is not None:
             with np.errstate(invalid="ignore"):
-                keep &= depth.variance < (_SURE * depth.z) ** 2
+                deviation = np.sqrt(depth.variance) / depth.z
+                # What all pixels share, as an unsure focal length, must not empty the cloud.
+                keep &= deviation <= max(_SURE, float(np.nanmedian(deviation)))
         own = camera.unproject(camera.pixel_grid()[keep], depth.z[keep].astype(np.float64))
         points.append(se3.transform(keyframe.T_map_camera, own))
         color = keyframe.image[keep]

@@ -15,6 +15,7 @@ sys.path.append(str(Path(__file__).parents[1] / "depth"))
 from views import Views, room
 
 from sf_bringup.calibration import CALIBRATE, calibrated
+from sf_bringup.photo_set import cloud
 from sf_bringup.pipeline import ProductionLine
 from sf_bringup.planner import plan
 from sf_bringup.preflight import inspect
@@ -26,7 +27,7 @@ from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import FormatError
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
-from sf_interfaces.types import Frame
+from sf_interfaces.types import Camera, DepthMap, Frame, Keyframe
 
 
 def photos(path: Path, views: Views) -> Path:
@@ -47,6 +48,16 @@ def test_photos_become_depth_poses_camera_cloud_and_contact_sheet(tmp_path: Path
     assert len(maps) == 3 and all(depth.density == 1.0 and depth.variance is not None for depth in maps)
     assert cv2.imread(str(folder.path / "contact_sheet.png")).shape == (3 * 240, 4 * 320, 3)
     assert (folder.path / "surface.ply").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("shared", "kept"), [(0.0, 50), (0.2, 50)])
+def test_a_deviation_that_all_pixels_share_does_not_empty_the_cloud(shared: float, kept: int) -> None:
+    camera = Camera(10, 10, 10.0, 10.0, 5.0, 5.0)
+    z = np.full((10, 10), 2.0, np.float32)
+    relative = np.where(np.arange(10)[:, None] < 5, 0.01, 0.4) * np.ones((10, 10))
+    depth = DepthMap(z, ((shared**2 + relative**2) * z**2).astype(np.float32))
+    keyframe = Keyframe(0, camera, np.zeros((10, 10, 3), np.uint8), np.eye(4), depth)
+    assert len(cloud([keyframe])) == kept
 
 
 def test_one_photo_is_no_set(tmp_path: Path) -> None:
