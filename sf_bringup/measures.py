@@ -193,6 +193,8 @@ def measure_completion(run: RunFolder, holdout: float, seed: int = 0) -> DepthEr
     for stamp, depth in decoded(run.result, topics.KEYFRAME_DEPTH.name, decode_depth):
         if depth.density > DENSE_FRACTION:
             break
+        if not depth.valid.any():
+            continue  # between two sweeps
         row, col = np.nonzero(depth.valid)
         dropped = rng.permutation(len(row))[: int(holdout * len(row))]
         kept, target = np.array(depth.z), np.full_like(depth.z, np.nan)
