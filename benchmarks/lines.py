@@ -123,7 +123,7 @@ def run(bag: Path, line: Line, engine: str, out: Path) -> dict[str, Any]:
 
 def geometry(folder: Path) -> Float64 | None:
     """What a run has estimated, [N, D] m: its positions, else its surface, else its depth."""
-    if (folder / "trajectory.tum").is_file():
+    if (folder / "trajectory.tum").is_file() and (folder / "trajectory.tum").stat().st_size:
         return read_tum(folder / "trajectory.tum").positions
     if (folder / "surface.ply").is_file():
         return read_surface(folder / "surface.ply").vertices

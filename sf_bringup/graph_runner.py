@@ -18,6 +18,7 @@ from rclpy.node import Node
 from sf_bringup.launcher import Process, stop_all
 from sf_bringup.launcher_env import node_environment
 from sf_bringup.line import Line
+from sf_bringup.pipeline import untracked
 from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.progress import Progress
@@ -126,6 +127,9 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
             stop_all([*graph.processes, *helpers])  # at once: each may take its whole patience
     for sentence in watch.errors:
         print(f"sf: {sentence}", file=sys.stderr)
+    poses = folder.path / "trajectory.tum"
+    if poses.is_file() and not poses.stat().st_size:
+        raise untracked(given)
     return {}
 
 

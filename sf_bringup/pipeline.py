@@ -200,12 +200,17 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
         if line.lacks_depth:
             raise FormatError(f"no frame of {given.bag} got depth: {'; '.join(line.reasons) or 'nothing was measured'}")
         if line.tracker is not None and not len(line.tracker.trajectory()):
-            raise TrackingLost(
-                f"none of the {done} frames of {given.bag} could be tracked: it takes texture and, without depth, "
-                "a camera that moves sideways; give such images, depth, or --poses"
-            )
+            raise untracked(given)
         _save(folder, line, writer)
     return dict(inputs.assembler.reasons) | line.reasons
+
+
+def untracked(given: BagInput) -> TrackingLost:
+    """What to say of an input of which no frame got a pose."""
+    return TrackingLost(
+        f"none of the frames of {given.bag} could be tracked: it takes texture and, without depth, "
+        "a camera that moves sideways; give such images, depth, or --poses"
+    )
 
 
 def _inputs(given: BagInput, made: Plan, config: ConfigFile) -> SensorInputs:

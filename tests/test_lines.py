@@ -226,7 +226,7 @@ def test_images_that_cannot_be_tracked_are_refused_in_words(tmp_path: Path, caps
     assert cli.main(["plan", str(tmp_path / "m.mcap"), "--goal", "recon"]) == 0
     assert "tracking -> depth:slam -> recon" in capsys.readouterr().out
     said = refused(capsys, "run", str(tmp_path / "m.mcap"), "--goal", "recon", "--out", str(tmp_path / "o"))
-    assert "none of the 3 frames" in said and "could be tracked" in said and "--poses" in said
+    assert "none of the frames" in said and "could be tracked" in said and "--poses" in said
 
 
 @pytest.mark.parametrize("broken", ["size", "empty", "backwards", "zero"])
