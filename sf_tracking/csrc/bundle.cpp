@@ -68,16 +68,8 @@ void add_pair(const Camera& camera, const Bundle& p, int s, int t, double scale,
         const double on[2][2] = {{weight * root[0] * camera.fx, weight * root[1] * camera.fy},
                                  {0.0, weight * root[2] * camera.fy}};
         double J[2][6], J_w[2], couple[6];
-        for (int i = 0; i < 2; ++i) {
-            const double a = on[i][0], b = on[i][1];
-            J[i][0] = a * d;
-            J[i][1] = b * d;
-            J[i][2] = -d * (a * q.x + b * q.y);
-            J[i][3] = -a * q.x * q.y - b * (1 + q.y * q.y);
-            J[i][4] = a * (1 + q.x * q.x) + b * q.x * q.y;
-            J[i][5] = b * q.x - a * q.y;
-            J_w[i] = a * along_u + b * along_v;
-        }
+        by_pose(on, d, q.x, q.y, J);
+        for (int i = 0; i < 2; ++i) J_w[i] = on[i][0] * along_u + on[i][1] * along_v;
         for (int i = 0; i < 6; ++i) {
             couple[i] = J[0][i] * J_w[0] + J[1][i] * J_w[1];
             pair.g[i] += J[0][i] * r[0] + J[1][i] * r[1];

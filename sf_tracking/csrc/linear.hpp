@@ -3,6 +3,8 @@
 #pragma once
 #include <cmath>
 
+#include "simd.hpp"
+
 namespace sf {
 
 struct Camera {
@@ -60,6 +62,20 @@ inline void move(const double* xi, double* T) {
             out[4 * i + j] = s;
         }
     for (int i = 0; i < 12; ++i) T[i] = out[i];
+}
+
+// Derivative of a whitened reprojection by a small motion (translation, rotation) of the camera that sees it, at
+// (x, y) of the image plane; ``on`` whitens and holds the focal lengths, d is inverse depth there.
+SF_INLINE void by_pose(const double on[2][2], double d, double x, double y, double J[2][6]) {
+    for (int i = 0; i < 2; ++i) {
+        const double a = on[i][0], b = on[i][1];
+        J[i][0] = a * d;
+        J[i][1] = b * d;
+        J[i][2] = -d * (a * x + b * y);
+        J[i][3] = -a * x * y - b * (1 + y * y);
+        J[i][4] = a * (1 + x * x) + b * x * y;
+        J[i][5] = b * x - a * y;
+    }
 }
 
 }  // namespace sf

@@ -49,15 +49,7 @@ void linearise(const Camera& camera, const double* T, const Sights& s, double sc
         const double on[2][2] = {{weight * root[0] * camera.fx, weight * root[1] * camera.fy},
                                  {0.0, weight * root[2] * camera.fy}};
         double J[2][6];
-        for (int k = 0; k < 2; ++k) {
-            const double a = on[k][0], b = on[k][1];
-            J[k][0] = a * d;
-            J[k][1] = b * d;
-            J[k][2] = -d * (a * p.x + b * p.y);
-            J[k][3] = -a * p.x * p.y - b * (1 + p.y * p.y);
-            J[k][4] = a * (1 + p.x * p.x) + b * p.x * p.y;
-            J[k][5] = b * p.x - a * p.y;
-        }
+        by_pose(on, d, p.x, p.y, J);
         for (int i = 0; i < 6; ++i) {
             g[i] += J[0][i] * r[0] + J[1][i] * r[1];
             for (int j = 0; j <= i; ++j) H[6 * i + j] += J[0][i] * J[0][j] + J[1][i] * J[1][j];
