@@ -240,13 +240,15 @@ def surface_errors(surface: Samples, given: Samples, views: tuple[Camera, Float6
     return errors
 
 
-def held_out_stamps(run: RunFolder) -> list[int]:
-    """Evenly spread frames that are not keyframes: the colour field has never seen them."""
+def held_out_poses(run: RunFolder) -> dict[int, Float64]:
+    """T_map_camera, by stamp, of evenly spread frames that are not keyframes: the colour field has never seen them."""
+    poses = frame_poses(run)
     known = {int(s) for s in run.keyframe_poses().stamps_ns}
     first, last = (min(known), max(known)) if known else (0, 0)
-    free = [int(s) for s in frame_poses(run).stamps_ns if int(s) not in known and first < int(s) < last]
+    pairs = zip(poses.stamps_ns.tolist(), poses.poses, strict=True)
+    free = [(stamp, T) for stamp, T in pairs if stamp not in known and first < stamp < last]
     step = max(1, len(free) // HELD_OUT_VIEWS)
-    return free[::step][:HELD_OUT_VIEWS]
+    return dict(free[::step][:HELD_OUT_VIEWS])
 
 
 def frame_poses(run: RunFolder) -> Trajectory:
@@ -271,12 +273,10 @@ def frame_poses(run: RunFolder) -> Trajectory:
 def render_held_out(run: RunFolder) -> list[HeldOutView]:
     """Interpolated views: frames between keyframes, drawn at their estimated or given poses."""
     topic = run.info()["topics"].get("rgb")
-    stamps = held_out_stamps(run)
-    if not stamps or topic is None:
+    pose_of = held_out_poses(run)
+    if not pose_of or topic is None:
         return []
-    poses = frame_poses(run)
-    pose_of = dict(zip(poses.stamps_ns.tolist(), poses.poses, strict=True))
-    return render_at(run, input_bag(run), topic, {stamp: pose_of[stamp] for stamp in stamps})
+    return render_at(run, input_bag(run), topic, pose_of)
 
 
 def render_novel(run: RunFolder, bag: Path | None = None) -> list[HeldOutView]:

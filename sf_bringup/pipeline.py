@@ -114,9 +114,8 @@ class ProductionLine:
             self.reconstruction.finish()
 
     def _finish_keyframes(self, update: Any) -> None:
-        """Take final keyframes on; a correction that comes with them belongs to the last."""
-        for keyframe in update.keyframes:
-            correction = update.correction if keyframe is update.keyframes[-1] else None
+        """Take final keyframes on, and the correction that comes with the last."""
+        for keyframe, correction in update.corrected_keyframes():
             self.keyframe_poses[keyframe.stamp_ns] = keyframe.T_map_camera
             if correction is not None:
                 self.keyframe_poses |= dict(zip(correction.stamps_ns.tolist(), correction.poses, strict=True))

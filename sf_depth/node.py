@@ -40,6 +40,7 @@ class DepthNode(BlockNode):
         from sf_interfaces.srv import EstimateDepth
 
         super().__init__()
+        self._config: DepthConfig | None = None
         self._one_shot: OneShot | None = None
         self.service(EstimateDepth, "estimate_depth", forwarded(self, "estimate"))
 
@@ -47,7 +48,7 @@ class DepthNode(BlockNode):
         """The completer and its keyframes."""
         self.leader = ""
         config = self.config()
-        self._one_shot = OneShot(config)
+        self._config, self._one_shot = config, None
         self._depth = self._part(config)
         if self._depth is None:
             return
@@ -100,9 +101,11 @@ class DepthNode(BlockNode):
         raise ConfigError(f"mode '{config.mode}' of the depth node is not known; use complete, slam, posed or mvd")
 
     def _estimate(self, request: Any, response: Any) -> None:
-        if self._one_shot is None:
+        if self._config is None:
             response.message = "the depth node is not configured yet; configure it and call again"
             return
+        if self._one_shot is None:  # with the first call: most lines never make one
+            self._one_shot = OneShot(self._config)
         service.answer(self._one_shot, request, response)
         self.health.count("calls answered")
 

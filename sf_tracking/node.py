@@ -103,8 +103,7 @@ class TrackingNode(BlockNode):
             self._publish_path(self._tracker.trajectory())
 
     def _send_keyframes(self, update: TrackingUpdate) -> None:
-        for keyframe in update.keyframes:
-            correction = update.correction if keyframe is update.keyframes[-1] else None
+        for keyframe, correction in update.corrected_keyframes():
             publish_bundle(self, keyframe, TRACKED, set(TRACKED), correction)
             self.health.count("keyframes")
             self.sent_one(keyframe.stamp_ns)

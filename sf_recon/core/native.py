@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sf_interfaces.errors import ConfigError
+from sf_interfaces.native import kernels
 
 
 def native() -> Any:
@@ -14,10 +14,4 @@ def native() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        from sf_recon import _native  # type: ignore[attr-defined]
-    except ImportError as error:
-        raise ConfigError(
-            f"the compiled kernels sf_recon._native are missing ({error}); run `make` in the repository"
-        ) from error
-    return _native
+    return kernels("sf_recon")

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sf_interfaces.errors import ConfigError
+from sf_interfaces.native import kernels
 from sf_interfaces.types import Camera, Float64
 
 
@@ -17,13 +17,7 @@ def native() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        from sf_tracking import _native  # type: ignore[attr-defined]
-    except ImportError as error:
-        raise ConfigError(
-            f"the compiled kernels sf_tracking._native are missing ({error}); run `make` in the repository"
-        ) from error
-    return _native
+    return kernels("sf_tracking")
 
 
 def intrinsics(camera: Camera) -> Float64:

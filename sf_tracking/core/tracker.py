@@ -3,6 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Enum
 
@@ -56,6 +57,11 @@ class TrackingUpdate:
     inliers: int = 0
     correction: Trajectory | None = None
     T_map_odom: Float64 | None = None
+
+    def corrected_keyframes(self) -> Iterator[tuple[Keyframe, Trajectory | None]]:
+        """The keyframes, and with the last one the correction: it holds from just before that one on."""
+        for keyframe in self.keyframes:
+            yield keyframe, self.correction if keyframe is self.keyframes[-1] else None
 
     @property
     def T_odom_camera(self) -> Float64 | None:
