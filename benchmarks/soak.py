@@ -1,6 +1,6 @@
 """A live RGB-D line for a while: memory, drops and rates, as the nodes report them and as they are.
 
-    python benchmarks/soak.py [--seconds 120] [--rate 15] [--width 640] [--out soak.json]
+    python benchmarks/soak.py [--seconds 120] [--rate 15] [--frames 100] [--width 640] [--out soak.json]
 
 A driver process publishes a simulated walk there and back again, with sensor-data QoS; ``sf up`` builds the line.
 Prints a table and writes JSON. Exit code 1: a keyframe was lost, or a node died.
@@ -23,20 +23,20 @@ from typing import Any
 
 import numpy as np
 
-FRAMES, SAMPLE_S, WARM_S = 40, 5.0, 30.0
+SAMPLE_S, WARM_S, SAVE_S = 5.0, 30.0, 60.0
 FAST = ["--set", "recon.iterations=4"]
 
 
-def render(width: int, path: Path) -> None:
-    """Colour, millimetres and intrinsics of a short walk."""
+def render(width: int, count: int, path: Path) -> None:
+    """Colour, millimetres and intrinsics of a walk of ``count`` frames."""
     from sf_bringup.simulate import SimulationSpec, Simulator
 
     height, focal = width * 3 // 4, width * 0.75
     spec = SimulationSpec(
-        "lounge", frames=FRAMES, fps=15.0, depth="exact", width=width, height=height, focal=focal, supersampling=1
+        "lounge", frames=count, fps=15.0, depth="exact", width=width, height=height, focal=focal, supersampling=1
     )
     simulator = Simulator(spec)
-    frames = [simulator.frame(i) for i in range(FRAMES)]
+    frames = [simulator.frame(i) for i in range(count)]
     camera = spec.camera
     np.savez(
         path,
@@ -157,13 +157,16 @@ def summarise(watch: Watch, begin: float, seconds: float) -> dict[str, Any]:
 
 def soak(args: argparse.Namespace) -> dict[str, Any]:
     """Start the driver and the line, watch, end both."""
-    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **os.environ}
+    from sf_bringup.launcher_env import node_environment
+
+    # The driver too has the transports of docs/live.md: by default Fast DDS loses images of this size.
+    environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", **node_environment()}
     os.environ.update(environment)
     with tempfile.TemporaryDirectory() as folder:
         frames, out = Path(folder) / "frames.npz", Path(folder) / "run"
-        render(args.width, frames)
+        render(args.width, args.frames, frames)
         driver = [sys.executable, __file__, "--publish", str(frames), "--rate", str(args.rate)]
-        line = [sys.executable, "-m", "sf_bringup.cli", "up", "--goal", "recon", "--out", str(out), *FAST]
+        line = [sys.executable, "-m", "sf_bringup.cli", "up", "--goal", "recon", "--out", str(out), "--save-s", str(SAVE_S), *FAST]
         children = [subprocess.Popen(driver, env=environment)]
         try:
             watch = Watch(out)
@@ -173,7 +176,7 @@ def soak(args: argparse.Namespace) -> dict[str, Any]:
             watch.run(args.seconds, begin)
             result = summarise(watch, begin, args.seconds)
             children[1].send_signal(signal.SIGINT)
-            result["exit_code"] = children[1].wait(timeout=120)
+            result["exit_code"] = children[1].wait(timeout=2 * SAVE_S)
             result["map_mb"] = (out / "map.sfmap").stat().st_size / 1e6 if (out / "map.sfmap").is_file() else 0.0
         finally:
             for child in children:
@@ -186,6 +189,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=120.0)
     parser.add_argument("--rate", type=float, default=15.0)
+    parser.add_argument("--frames", type=int, default=100, help="of the walk, which is gone there and back again")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--out", type=Path, default=Path("soak.json"))
     parser.add_argument("--publish", type=Path, help=argparse.SUPPRESS)

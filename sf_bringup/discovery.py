@@ -75,7 +75,7 @@ def probe(msg: Any) -> Probe:
 
 def needs_probe(types: Mapping[str, str]) -> list[str]:
     """Topics whose type alone does not tell their role."""
-    return sorted(name for name, kind in types.items() if _is_image(kind) and is_input(name))
+    return sorted(name for name, kind in types.items() if is_image(kind) and is_input(name))
 
 
 def is_input(name: str) -> bool:
@@ -93,7 +93,9 @@ def is_wanted(kind: str) -> bool:
     return any(takes(role, kind) for role in ROLES)
 
 
-def _is_image(kind: str) -> bool:
+def is_image(kind: str) -> bool:
+    """Whether a message type is an image, raw or compressed."""
+    """Whether a message type is an image, raw or compressed."""
     return takes("rgb", kind)
 
 
@@ -165,7 +167,7 @@ def discover(
     _check_user(user, types)
     decision = _Decision(dict(user), [f"{role} from {topic}, as you asked" for role, topic in user.items()])
     inputs = {name: kind for name, kind in types.items() if is_input(name)}
-    images = [n for n, kind in inputs.items() if _is_image(kind) and n in probes]
+    images = [n for n, kind in inputs.items() if is_image(kind) and n in probes]
     decision.reasons += [f"{n} left out: {probes[n].problem}" for n in sorted(images) if probes[n].problem]
     images = [n for n in images if not probes[n].problem]
     depth = [n for n in images if _is_depth(n, probes[n])]

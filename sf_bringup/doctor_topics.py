@@ -4,10 +4,11 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.serialization import deserialize_message
@@ -15,6 +16,7 @@ from rclpy.serialization import deserialize_message
 from sf_bringup import discovery
 from sf_bringup.discovery import InputMapping, Probe
 from sf_bringup.doctor import Check
+from sf_bringup.launcher_env import node_environment
 from sf_bringup.planner import plan
 from sf_interfaces import topics
 from sf_interfaces.blocks import Quantity, load_blocks
@@ -22,6 +24,10 @@ from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.ros.frames import FrameTree
 from sf_interfaces.ros.messages import decode_camera_info, decode_tf, rclpy_factory
 from sf_interfaces.ros.qos import qos_profile
+from sf_interfaces.ros.stamps import stamp_of
+
+_LOST = 0.05  # share of lost images that is worth a word
+_STEPS = 10  # between images, before anything is said of losses
 
 
 @dataclass(slots=True)
@@ -31,6 +37,7 @@ class Heard:
     types: dict[str, str] = field(default_factory=dict)
     counts: Counter[str] = field(default_factory=Counter)
     bytes: Counter[str] = field(default_factory=Counter)
+    stamps: defaultdict[str, list[int]] = field(default_factory=lambda: defaultdict(list))  # ns, of images
     quality: dict[str, str] = field(default_factory=dict)
     probes: dict[str, Probe] = field(default_factory=dict)
     infos: dict[str, Any] = field(default_factory=dict)
@@ -51,6 +58,8 @@ def listen(seconds: float) -> Heard:
         def take(raw: bytes) -> None:
             heard.counts[name] += 1
             heard.bytes[name] += len(raw)
+            if discovery.is_image(kind):
+                heard.stamps[name].append(stamp_of(raw))
             if heard.counts[name] == 1:
                 _first(heard, name, deserialize_message(raw, cls))
 
@@ -108,7 +117,25 @@ def _topic(heard: Heard, name: str, seconds: float) -> Check:
     found = heard.probes.get(name, Probe())
     if found.problem:
         return Check(name, False, f"{about}: {found.problem}", "choose another topic with --map")
-    return Check(name, True, f"{about}{f', {found.encoding}' if found.encoding else ''}")
+    about += f", {found.encoding}" if found.encoding else ""
+    lost = _share_lost(heard.stamps[name])
+    if lost > _LOST:
+        size = heard.bytes[name] / heard.counts[name] / 1e6
+        profile = node_environment()["FASTRTPS_DEFAULT_PROFILES_FILE"]
+        mend = f"start the driver with FASTRTPS_DEFAULT_PROFILES_FILE={profile}, or let it publish compressed images"
+        detail = f"{about}: by its stamps {lost:.0%} of the messages of {size:.2f} MB are lost on the way"
+        return Check(name, False, detail, mend)
+    return Check(name, True, about)
+
+
+def _share_lost(stamps: list[int]) -> float:
+    """Share of the messages that are missing between others; short steps, if many are, tell the period."""
+    steps = np.diff(np.sort(stamps))
+    if len(steps) < _STEPS:
+        return 0.0
+    period = max(float(np.median(steps[steps <= 1.5 * np.quantile(steps, 0.25)])), 1.0)
+    missing = float(np.sum(np.round(steps / period) - 1))
+    return missing / (missing + len(stamps))
 
 
 def _together(heard: Heard) -> list[Check]:

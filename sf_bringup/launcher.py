@@ -88,9 +88,14 @@ def node_command(launch: NodeLaunch, folder: Path) -> list[str]:
     return [sys.executable, "-m", launch.module, "--ros-args", "--params-file", str(path), *remaps]
 
 
-def stop_all(processes: Sequence[Process], interrupt_s: float = _INTERRUPT_S) -> None:
-    """End every process: SIGINT, then SIGTERM, then SIGKILL; all are gone when this returns."""
+def stop_all(processes: Sequence[Process], interrupt_s: float = _INTERRUPT_S) -> list[str]:
+    """End every process: SIGINT, then SIGTERM, then SIGKILL; all are gone when this returns.
+
+    Returns:
+        Names of those that had to be ended before they had completed what SIGINT lets them complete.
+    """
     running = [p for p in processes if p.poll() is None]
+    cut_short: list[str] = []
     for number, patience in (
         (signal.SIGINT, interrupt_s),
         (signal.SIGTERM, _TERMINATE_S),
@@ -102,5 +107,8 @@ def stop_all(processes: Sequence[Process], interrupt_s: float = _INTERRUPT_S) ->
         while running and time.monotonic() < deadline:
             running = [p for p in running if p.poll() is None]
             time.sleep(0.02)
+        if number == signal.SIGINT:
+            cut_short = [p.name for p in running]
         if not running:
-            return
+            break
+    return cut_short

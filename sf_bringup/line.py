@@ -168,17 +168,19 @@ class Line:
             raise SceneFactoryError(f"{why}; see {log}")
         return f"{why}; the line goes on without {', '.join(lost)}; see {log}"
 
-    def stop(self, save_s: float = 0.0) -> None:
+    def stop(self, save_s: float = 0.0) -> list[str]:
         """End all nodes; they are gone when this returns, and so is the shared memory of those that were killed.
 
         Args:
             save_s: how long live nodes may take to write their results; 0: no longer than a moment.
+
+        Returns:
+            Names of nodes that had not written everything by then.
         """
-        if save_s:
-            stop_all(self.processes, interrupt_s=save_s)
-        stop_all(self.processes)
+        cut_short = stop_all(self.processes, interrupt_s=save_s) if save_s else stop_all(self.processes)
         self._running.clear()
         sweep_shared_memory()
+        return cut_short
 
     def _spawn(self, launch: NodeLaunch, *, resume: bool = False) -> Process:
         if resume:

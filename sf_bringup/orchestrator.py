@@ -103,8 +103,12 @@ class Orchestrator(Node):
             self.get_logger().warning(sentence)
 
     def stop(self) -> None:
-        """End all nodes, when they have written their results."""
-        self._line.stop(self._save_s)
+        """End all nodes, when they have written their results; say which of them had not."""
+        for name in self._line.stop(self._save_s):
+            self.get_logger().warning(
+                f"{name} had not written all its results after {self._save_s:g} s: give it time with --save-s 60; "
+                f"what it saved on the way is in {self._folder / 'state'}"
+            )
 
     # ---- inside
 

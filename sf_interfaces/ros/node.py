@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from struct import unpack_from
 from typing import Any, ClassVar
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -29,6 +28,7 @@ from sf_interfaces.ros import messages, parameters
 from sf_interfaces.ros.diagnostics import DiagnosticsPublisher, Health
 from sf_interfaces.ros.inbox import Inbox
 from sf_interfaces.ros.qos import qos_profile
+from sf_interfaces.ros.stamps import stamp_of
 from sf_interfaces.sync import SyncConfig
 from sf_interfaces.topics import Topic
 
@@ -46,12 +46,6 @@ class NodeOptions:
     autostart: bool = option(False, "configure and activate without an orchestrator")
     out: str = option("", "folder for this node's files, written at the end (empty: none)")
     resume: bool = option(False, "go on from the snapshot that a node of this name left in out/state")
-
-
-def stamp_of(raw: bytes) -> int:
-    """Stamp in ns of a serialised message that begins with a std_msgs/Header (CDR), without decoding it."""
-    seconds, nanoseconds = unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
 class BlockNode(LifecycleNode):

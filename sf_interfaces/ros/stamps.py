@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import array
 from collections.abc import Callable
+from struct import unpack_from
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,12 @@ def to_stamp(make: Factory, stamp_ns: int) -> Any:
     if not 0 <= sec < 2**31:
         raise FormatError(f"stamp {stamp_ns} ns does not fit a message; give nanoseconds since 1970")
     return make("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
+
+
+def stamp_of(raw: bytes) -> int:
+    """Stamp in ns of a serialised message that begins with a std_msgs/Header (CDR), without decoding it."""
+    seconds, nanoseconds = unpack_from("<iI" if raw[1] & 1 else ">iI", raw, 4)
+    return int(seconds) * _SECOND + int(nanoseconds)
 
 
 def header(make: Factory, stamp_ns: int, frame_id: str) -> Any:

@@ -8,11 +8,12 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sf_bringup import cli, doctor
 from sf_bringup.discovery import Probe
-from sf_bringup.doctor_topics import Heard, _together, _topic
+from sf_bringup.doctor_topics import Heard, _share_lost, _together, _topic
 from sf_bringup.shared_memory import orphaned_segments, sweep_shared_memory
 
 IMAGE, INFO, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
@@ -89,3 +90,18 @@ def test_silence_a_wrong_frame_and_a_missing_extrinsic_are_found() -> None:
     by_name = {c.name: c for c in _together(heard(lidar=True))}
     assert not by_name["extrinsic"].ok and "static_transform_publisher" in by_name["extrinsic"].mend
     assert by_name["calibration"].ok and "tracking" in by_name["line"].detail
+
+
+def test_images_that_transports_lose_are_told_by_their_stamps() -> None:
+    rng = np.random.default_rng(3)
+    stamps = 1_000_000_000 + np.arange(200) * 66_666_667 + rng.integers(-4_000_000, 4_000_000, 200)
+    assert _share_lost(stamps.tolist()) == 0.0
+    for share in (0.2, 0.5, 0.7):
+        kept = stamps[rng.random(200) >= share]
+        assert abs(_share_lost(kept.tolist()) - (1 - len(kept) / 200)) < 0.03
+    lossy = heard()
+    lossy.quality["/cam/image_raw"] = "best_effort volatile"
+    lossy.counts["/cam/image_raw"], lossy.bytes["/cam/image_raw"] = len(kept), 921_600 * len(kept)
+    lossy.stamps["/cam/image_raw"] = kept.tolist()
+    found = _topic(lossy, "/cam/image_raw", 3.0)
+    assert not found.ok and "lost on the way" in found.detail and "FASTRTPS_DEFAULT_PROFILES_FILE" in found.mend
