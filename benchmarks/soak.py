@@ -166,7 +166,8 @@ def soak(args: argparse.Namespace) -> dict[str, Any]:
         frames, out = Path(folder) / "frames.npz", Path(folder) / "run"
         render(args.width, args.frames, frames)
         driver = [sys.executable, __file__, "--publish", str(frames), "--rate", str(args.rate)]
-        line = [sys.executable, "-m", "sf_bringup.cli", "up", "--goal", "recon", "--out", str(out), "--save-s", str(SAVE_S), *FAST]
+        goal = ["--goal", "recon", "--out", str(out), "--save-s", str(SAVE_S), *FAST]
+        line = [sys.executable, "-m", "sf_bringup.cli", "up", *goal]
         children = [subprocess.Popen(driver, env=environment)]
         try:
             watch = Watch(out)
