@@ -24,6 +24,8 @@ _NEIGHBOURS = 8  # sparse points that define a surface normal
 _FLAT = 0.1  # residual of that plane relative to its extent
 _POINTS = 1500  # sparse points compared at most
 _SCALE = 2.0  # of the robust kernel, standard deviations
+_LEAST = 0.03  # of the sensor's noise model: no depth is believed to be better than that
+_OVERLAP = 0.2  # of the source's points must fall on the target's surface, near or far
 _MIN_POINTS = 60
 _FIRST_REACH, _REACH = 0.10, 0.03  # relative to depth: how far apart surfaces may lie, at first and at last
 _SLACK = 0.02  # added to both
@@ -39,7 +41,7 @@ class Shape:
     normals: Float64  # [K, 3] unit, NaN where the surface is not smooth
     grid: NDArray[np.int64] | None  # [h, w] index of the point in each cell, -1: none; None: scattered points
     tree: cKDTree | None  # of scattered points
-    sigma: Float64  # [K] m, deviation of depth
+    sigma: Float64  # [K] m, deviation of depth at most
 
     def __len__(self) -> int:
         return len(self.points)
@@ -51,7 +53,8 @@ class ShapeFit:
 
     T: Float64  # [4, 4] T_target_source
     information: Float64  # [6, 6] for exp(xi) T
-    share: float  # of the source's points that lie on the target's surface
+    share: float  # of the source's points that fall on the target's surface: those that lie on it
+    overlap: float  # of the source's points: those that fall on the target's surface
 
 
 def shape_of(frame: Frame, config: TrackingConfig) -> Shape | None:
@@ -112,19 +115,19 @@ def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64
         prior: [6, 6] information of ``T``, for exp(xi) T.
         trust: share of the points that count as independent: sensors err alike in neighbouring pixels.
     """
-    away, H, share = np.zeros(6), np.zeros((6, 6)), 0.0
+    away, H, share, overlap = np.zeros(6), np.zeros((6, 6)), 0.0, 0.0
     for step_index in range(_STEPS):
         moved = se3.transform(T, source.points)
         partner = _partners(camera, target, moved)
         reach = (_FIRST_REACH if step_index == 0 else _REACH) + _SLACK
-        H, g, used = native().plane_system(
-            dense(moved), source.sigma, partner, target.points, target.normals, reach, _SCALE, trust
+        H, g, used, met = native().plane_system(
+            dense(moved), source.sigma, partner, target.points, target.normals, reach, _SCALE, _LEAST, trust
         )
-        if used < _MIN_POINTS:
+        share, overlap = used / max(1, met), met / len(source)
+        if used < _MIN_POINTS or overlap < _OVERLAP:
             return None
-        share = used / len(source)
         step = np.linalg.solve(H + prior, g - prior @ away)
         T, away = se3.exp(step) @ T, away + step
         if np.abs(step).max() < _STILL:
             break
-    return ShapeFit(se3.orthonormalise(T), H, share)
+    return ShapeFit(se3.orthonormalise(T), H, share, overlap)

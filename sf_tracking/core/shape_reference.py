@@ -37,21 +37,26 @@ def partners(camera: Camera, moved: Float64, grid: NDArray[np.int64]) -> NDArray
 
 def plane_system(
     moved: Float64, sigma: Float64, partner: NDArray[np.int64], points: Float64, normals: Float64, reach: float,
-    scale: float, trust: float,
-) -> tuple[Float64, Float64, int]:  # fmt: skip
-    """H [6, 6], g [6] of the robust distances of moved points [K, 3] to the planes of their partners, and how many.
+    scale: float, least: float, trust: float,
+) -> tuple[Float64, Float64, int, int]:  # fmt: skip
+    """H [6, 6], g [6] of the robust distances of moved points [K, 3] to the planes of their partners.
+
+    And how many points count, and how many have a partner, however far.
 
     Args:
-        sigma: [K] m, deviation of the points; reach: relative to depth, how far apart partners may lie.
+        sigma: [K] m, deviation of the points at most; how much smaller it is the distances themselves tell.
+        reach: relative to depth, how far apart partners may lie.
+        least: share of ``sigma`` that is believed at least.
     """
     n, p = normals[partner], points[partner]
     r = ((p - moved) * n).sum(axis=1)
     with np.errstate(invalid="ignore"):
-        good = (partner >= 0) & np.isfinite(r) & (np.linalg.norm(p - moved, axis=1) < reach * moved[:, 2])
+        met = (partner >= 0) & np.isfinite(r) & (sigma > 0)
+        good = met & (np.linalg.norm(p - moved, axis=1) < reach * moved[:, 2])
     if not good.any():
-        return np.zeros((6, 6)), np.zeros(6), 0
+        return np.zeros((6, 6)), np.zeros(6), 0, int(met.sum())
     n, r, moved = n[good], r[good], moved[good]
-    deviation = np.maximum(sigma[good], 1.4826 * np.median(np.abs(r)))
+    deviation = sigma[good] * max(least, 1.4826 * np.median(np.abs(r) / sigma[good]))
     weight = robust((r / deviation) ** 2, scale)[0] / deviation**2 * trust
     J = np.concatenate([n, np.cross(moved, n)], axis=1)
-    return (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r, int(good.sum())
+    return (J * weight[:, None]).T @ J, (J * weight[:, None]).T @ r, int(good.sum()), int(met.sum())

@@ -205,7 +205,8 @@ class Tracker:
         fitted = fit(newest.camera, shape, known, T, back.T @ base.information @ back, self._config.shape_trust)
         if fitted is None or (blind and fitted.share < _SAME_SURFACE):
             return found
-        return replace(base, T_cw=se3.inverse(fitted.T) @ newest.T_cw)
+        overlap = fitted.overlap if blind else base.overlap
+        return replace(base, T_cw=se3.inverse(fitted.T) @ newest.T_cw, overlap=overlap)
 
     def _remember(self, frame: Frame, view: View, found: Location) -> tuple[Keyframe, ...]:
         """Store the frame relative to a keyframe, or make it a keyframe and optimise the window."""
@@ -220,6 +221,10 @@ class Tracker:
         again, keyframe = None, None
         if wanted:
             again = self._locate.align(self._window.keyframes, view, found.T_cw, thorough=True)
+            if again is None and not found.inliers:
+                again = found  # no patches, but a surface that tells the pose
+            elif again is not None and again.doubtful and self._config.shape_trust:
+                again = self._fit_shape(frame, again)
             keyframe = None if again is None else self._window.make(frame, view, again.T_cw)
         if again is not None and keyframe is not None:
             self._window.add(keyframe, again)

@@ -126,7 +126,7 @@ class Window:
             self._observe(keyframe, target, found.excess)
             if count % _AT_ONCE == 0:
                 yield
-        if found.doubtful and self._config.shape_trust and others:
+        if self._config.shape_trust and others:
             self._align_shapes(keyframe, others[-self._config.shape_keyframes :])
             yield
         yield from self._optimise(fixed, iterations)

@@ -116,16 +116,16 @@ Out<int64_t> partners(In<double, 4> camera, In<double, -1, 3> moved, In<int64_t,
 }
 
 nb::tuple plane_system(In<double, -1, 3> moved, In<double, -1> sigma, In<int64_t, -1> partner, In<double, -1, 3> points,
-                       In<double, -1, 3> normals, double reach, double scale, double trust) {
+                       In<double, -1, 3> normals, double reach, double scale, double least, double trust) {
     require(sigma.shape(0) == moved.shape(0) && partner.shape(0) == moved.shape(0), "one sigma and partner per point");
     require(points.shape(0) == normals.shape(0), "one normal for each point");
     sf::PlaneSystem system;
     sf::plane_system(moved.data(), sigma.data(), partner.data(), moved.shape(0),
-                     {points.data(), normals.data(), points.shape(0)}, reach, scale, trust, system);
+                     {points.data(), normals.data(), points.shape(0)}, reach, scale, least, trust, system);
     Made<double> H({6, 6}), g({6});
     std::copy_n(system.H, 36, H.get());
     std::copy_n(system.g, 6, g.get());
-    return nb::make_tuple(H.give(), g.give(), system.used);
+    return nb::make_tuple(H.give(), g.give(), system.used, system.met);
 }
 
 sf::Bundle bundle_of(const In<double, -1, -1, 4, 4>& T_ts, const In<double, -1, -1, 2>& rays,
@@ -187,7 +187,7 @@ NB_MODULE(_native, m) {
     m.def("partners", &partners, nb::arg("camera"), nb::arg("moved"), nb::arg("grid"), nb::arg("to_col"),
           nb::arg("to_row"));
     m.def("plane_system", &plane_system, nb::arg("moved"), nb::arg("sigma"), nb::arg("partner"), nb::arg("points"),
-          nb::arg("normals"), nb::arg("reach"), nb::arg("scale"), nb::arg("trust"));
+          nb::arg("normals"), nb::arg("reach"), nb::arg("scale"), nb::arg("least"), nb::arg("trust"));
     m.def("bundle_cost", &bundle_cost, nb::arg("camera"), nb::arg("scale"), nb::arg("T_ts"), nb::arg("rays"),
           nb::arg("w"), nb::arg("prior"), nb::arg("prior_weight"), nb::arg("uv"), nb::arg("root"));
     m.def("linearise", &linearise, nb::arg("camera"), nb::arg("scale"), nb::arg("motion"), nb::arg("pull"),

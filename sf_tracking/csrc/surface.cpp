@@ -47,7 +47,8 @@ void partners(const double* moved, size_t count, const Grid& grid, int64_t* part
 }
 
 void plane_system(const double* moved, const double* sigma, const int64_t* partner, size_t count, const Surface& target,
-                  double reach, double scale, double trust, PlaneSystem& out) {
+                  double reach, double scale, double least, double trust, PlaneSystem& out) {
+    out.met = 0;
     std::vector<double> off, sorted;
     std::vector<size_t> used;
     off.reserve(count);
@@ -58,7 +59,9 @@ void plane_system(const double* moved, const double* sigma, const int64_t* partn
         const double d[3] = {p[0] - q[0], p[1] - q[1], p[2] - q[2]};
         const double r = d[0] * n[0] + d[1] * n[1] + d[2] * n[2];
         const double distance = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
-        if (!std::isfinite(r) || !(distance < reach * q[2])) continue;
+        if (!std::isfinite(r) || !(sigma[k] > 0)) continue;
+        ++out.met;
+        if (!(distance < reach * q[2])) continue;
         off.push_back(r);
         used.push_back(k);
     }
@@ -67,16 +70,16 @@ void plane_system(const double* moved, const double* sigma, const int64_t* partn
     out.used = static_cast<int64_t>(used.size());
     if (used.empty()) return;
     sorted.resize(off.size());
-    std::transform(off.begin(), off.end(), sorted.begin(), [](double r) { return std::abs(r); });
+    for (size_t i = 0; i < used.size(); ++i) sorted[i] = std::abs(off[i]) / sigma[used[i]];
     const size_t half = sorted.size() / 2;
     std::nth_element(sorted.begin(), sorted.begin() + half, sorted.end());
     double middle = sorted[half];
     if (sorted.size() % 2 == 0) middle = 0.5 * (middle + *std::max_element(sorted.begin(), sorted.begin() + half));
-    const double rough = 1.4826 * middle;
+    const double rough = std::max(1.4826 * middle, least);
     for (size_t i = 0; i < used.size(); ++i) {
         const size_t k = used[i];
         const double *n = target.normals + 3 * partner[k], *q = moved + 3 * k, r = off[i];
-        const double deviation = std::max(sigma[k], rough), far = r / (deviation * scale);
+        const double deviation = sigma[k] * rough, far = r / (deviation * scale);
         const double weight = trust / ((1.0 + far * far) * deviation * deviation);
         const double J[6] = {n[0], n[1], n[2], q[1] * n[2] - q[2] * n[1], q[2] * n[0] - q[0] * n[2],
                              q[0] * n[1] - q[1] * n[0]};

@@ -31,11 +31,13 @@ void partners(const double* moved, size_t count, const Grid& grid, int64_t* part
 struct PlaneSystem {
     double H[36], g[6];
     int64_t used;  // points that count
+    int64_t met;   // points with a partner, however far
 };
 
 // Normal equations of the robust distances of moved points [count, 3] to the planes of their partners.
-// reach: how far apart they may lie, relative to the depth of the point.
+// reach: how far apart they may lie, relative to the depth of the point. The points deviate by the share of ``sigma``
+// that their distances show, but by no less than the share ``least``.
 void plane_system(const double* moved, const double* sigma, const int64_t* partner, size_t count, const Surface& target,
-                  double reach, double scale, double trust, PlaneSystem& out);
+                  double reach, double scale, double least, double trust, PlaneSystem& out);
 
 }  // namespace sf

@@ -88,9 +88,10 @@ void meet_planes(int step, size_t each) {
     for (size_t i = 0; i < grid.size(); ++i) grid[i] = static_cast<int64_t>(i * 3) - 1;  // some beyond the surface
     sf::partners(moved.data(), count, {grid.data(), 9, 12, 0.2, 0.2, kCamera}, partner.data());
     sf::PlaneSystem system;
-    sf::plane_system(moved.data(), sigma.data(), partner.data(), count, {moved.data(), normals.data(), count}, 0.5, 2, 1,
-                     system);
-    expect(system.used >= 0 && system.used <= static_cast<int64_t>(count), "no more points than there are");
+    sf::plane_system(moved.data(), sigma.data(), partner.data(), count, {moved.data(), normals.data(), count}, 0.5, 2, 0.03,
+                     1, system);
+    expect(system.used >= 0 && system.used <= system.met, "no more points count than have a partner");
+    expect(system.met <= static_cast<int64_t>(count), "no more points than there are");
 }
 
 }  // namespace
