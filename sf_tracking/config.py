@@ -37,7 +37,7 @@ class TrackingConfig:
     depth_gap: float = option(0.05, "relative depth step near a patch above which it is rejected", low=0.0)
     depth_sigma: float = option(0.004, "noise of dense inverse depth, 1/m (depth errs with z^2)", low=1e-6)
     registration_px: float = option(1.0, "how well depth is registered to the image, standard deviation, px", low=0.0)
-    shape_trust: float = option(0.1, "share of depth points that count when surfaces are aligned", low=0.0, high=1.0)
+    shape_trust: float = option(1.0, "how much aligned surfaces count beside patches; 0: not at all", low=0.0, high=1.0)
     shape_keyframes: int = option(3, "keyframes to whose surface that of a new keyframe is aligned", low=0, high=20)
     lidar_sigma: float = option(0.015, "noise of LiDAR depth, m", low=1e-4)
     min_quality: float = option(0.002, "corner quality of a patch relative to the image's best", low=0.0, high=1.0)

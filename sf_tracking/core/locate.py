@@ -61,6 +61,16 @@ class Location:
         """Patches err more than they claim, or are few: measured depth has something to add."""
         return self.excess > _HONEST or self.inliers < _PLENTY
 
+    def seen_from(self, T: Float64) -> Float64:
+        """The information [6, 6] of the pose as one of exp(xi) T, with T = T_other_this."""
+        back = np.linalg.inv(se3.adjoint(T))
+        return np.asarray(back.T @ self.information @ back)
+
+    def distance(self, T: Float64, moved: Float64) -> float:
+        """Standard deviations between this pose, as T = T_other_this, and another opinion of it."""
+        xi = se3.log(moved @ se3.inverse(T))
+        return float(np.sqrt(xi @ self.seen_from(T) @ xi / len(xi)))
+
     def passes(self, shares: tuple[float, float]) -> bool:
         """Whether more than these shares of the patches were found, and of those agree."""
         return self.found > shares[0] and self.inliers > shares[1] * len(self.sights)

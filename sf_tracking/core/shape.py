@@ -24,7 +24,8 @@ _NEIGHBOURS = 8  # sparse points that define a surface normal
 _FLAT = 0.1  # residual of that plane relative to its extent
 _POINTS = 1500  # sparse points compared at most
 _SCALE = 2.0  # of the robust kernel, standard deviations
-_LEAST = 0.03  # of the sensor's noise model: no depth is believed to be better than that
+_LEAST = 0.03  # of the noise model of dense depth, which is that of the worst sensor; a scanner's noise is known
+_INDEPENDENT = 0.1  # share of the cells of dense depth: neighbours err alike. Points of a scanner do not
 _OVERLAP = 0.2  # of the source's points must fall on the target's surface, near or far
 _MIN_POINTS = 60
 _FIRST_REACH, _REACH = 0.10, 0.03  # relative to depth: how far apart surfaces may lie, at first and at last
@@ -41,7 +42,9 @@ class Shape:
     normals: Float64  # [K, 3] unit, NaN where the surface is not smooth
     grid: NDArray[np.int64] | None  # [h, w] index of the point in each cell, -1: none; None: scattered points
     tree: cKDTree | None  # of scattered points
-    sigma: Float64  # [K] m, deviation of depth at most
+    sigma: Float64  # [K] m, deviation of depth
+    least: float  # share of ``sigma`` that is believed at least, where distances show less
+    independent: float  # share of the points that err on their own
 
     def __len__(self) -> int:
         return len(self.points)
@@ -76,7 +79,8 @@ def _scattered(points: Float64, sigma: float) -> Shape:
     offset = near - near.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(offset.transpose(0, 2, 1) @ offset)
     flat = (values[:, 0] < _FLAT**2 * values[:, 1]) & (values[:, 1] > 1e-3 * values[:, 2])
-    return Shape(points, np.where(flat[:, None], vectors[:, :, 0], np.nan), None, tree, np.full(len(points), sigma))
+    normals = np.where(flat[:, None], vectors[:, :, 0], np.nan)
+    return Shape(points, normals, None, tree, np.full(len(points), sigma), least=1.0, independent=1.0)
 
 
 def _gridded(camera: Camera, z: Float32, sigma: float) -> Shape:
@@ -95,7 +99,7 @@ def _gridded(camera: Camera, z: Float32, sigma: float) -> Shape:
     normal[~smooth] = np.nan
     index = np.where(good, np.cumsum(good).reshape(h, w) - 1, -1)
     points = vertices[good]
-    return Shape(points, normal[good], index, None, sigma * points[:, 2] ** 2)
+    return Shape(points, normal[good], index, None, sigma * points[:, 2] ** 2, _LEAST, _INDEPENDENT)
 
 
 def _partners(camera: Camera, target: Shape, moved: Float64) -> NDArray[np.int64]:
@@ -113,15 +117,16 @@ def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64
 
     Args:
         prior: [6, 6] information of ``T``, for exp(xi) T.
-        trust: share of the points that count as independent: sensors err alike in neighbouring pixels.
+        trust: how much the points count beside the prior, 0 to 1.
     """
+    trust *= source.independent
     away, H, share, overlap = np.zeros(6), np.zeros((6, 6)), 0.0, 0.0
     for step_index in range(_STEPS):
         moved = se3.transform(T, source.points)
         partner = _partners(camera, target, moved)
         reach = (_FIRST_REACH if step_index == 0 else _REACH) + _SLACK
         H, g, used, met = native().plane_system(
-            dense(moved), source.sigma, partner, target.points, target.normals, reach, _SCALE, _LEAST, trust
+            dense(moved), source.sigma, partner, target.points, target.normals, reach, _SCALE, source.least, trust
         )
         share, overlap = used / max(1, met), met / len(source)
         if used < _MIN_POINTS or overlap < _OVERLAP:

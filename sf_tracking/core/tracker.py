@@ -201,8 +201,7 @@ class Tracker:
         blind = found is None
         base = blind_location(self._predict(frame.stamp_ns)) if found is None else found
         T = newest.T_cw @ se3.inverse(base.T_cw)
-        back = np.linalg.inv(se3.adjoint(T))
-        fitted = fit(newest.camera, shape, known, T, back.T @ base.information @ back, self._config.shape_trust)
+        fitted = fit(newest.camera, shape, known, T, base.seen_from(T), self._config.shape_trust)
         if fitted is None or (blind and fitted.share < _SAME_SURFACE):
             return found
         overlap = fitted.overlap if blind else base.overlap

@@ -22,6 +22,7 @@ _GUESS = 0.5  # relative deviation of an inverse depth that is only expected fro
 _NEIGHBOURS = 5  # known patches whose median a new patch without depth starts from
 _KNOWN = 0.3  # relative deviation up to which a patch counts as known
 _AT_ONCE = 2  # keyframes in which a new one's patches are looked for per part of the work
+_CONTRADICTION = 10.0  # standard deviations between patches and surfaces, beyond which the surfaces do not count
 _DONE = object()
 _RANGE = (1e-3, 50.0)  # of the median inverse depth, within which refined ones are kept
 
@@ -127,19 +128,22 @@ class Window:
             if count % _AT_ONCE == 0:
                 yield
         if self._config.shape_trust and others:
-            self._align_shapes(keyframe, others[-self._config.shape_keyframes :])
+            self._align_shapes(keyframe, others[-self._config.shape_keyframes :], found)
             yield
         yield from self._optimise(fixed, iterations)
 
-    def _align_shapes(self, keyframe: TrackedKeyframe, others: list[TrackedKeyframe]) -> None:
-        """Relative motions of a keyframe from its measured surface and those of others."""
+    def _align_shapes(self, keyframe: TrackedKeyframe, others: list[TrackedKeyframe], found: Location) -> None:
+        """Relative motions of a keyframe from its measured surface and those of others.
+
+        Surfaces that contradict patches which agree with each other are those of something that moves.
+        """
         for target in others:
             source_shape, target_shape = (k.measured_shape(self._config) for k in (keyframe, target))
             if source_shape is not None and target_shape is not None:
                 T = target.T_cw @ se3.inverse(keyframe.T_cw)
                 trust = self._config.shape_trust
                 moved = fit(keyframe.camera, source_shape, target_shape, T, np.eye(6), trust)
-                if moved is not None:
+                if moved is not None and (found.doubtful or found.distance(T, moved.T) < _CONTRADICTION):
                     keyframe.moved[target.frame.stamp_ns] = moved
 
     def _observe(self, source: TrackedKeyframe, target: TrackedKeyframe, excess: float) -> None:

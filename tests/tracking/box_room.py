@@ -107,7 +107,7 @@ def circle(count: int, lap: int, radius: float) -> Float64:
     return np.array(poses)
 
 
-def warming_up(frames: list[Frame], first: int, last: int, share: float = 0.1) -> list[Frame]:
+def warming_up(frames: list[Frame], first: int, last: int, share: float = 0.06) -> list[Frame]:
     """The same frames with dense depth that is too far from one to another, by ``share`` half way between them."""
     out = list(frames)
     for k in range(first, last):
