@@ -120,13 +120,16 @@ def side_by_side(ours: Callable[[], Any], modules: tuple[str, ...], frames: Sequ
     return rows + [{"system": name, "remark": reason} for name, reason in missing.items()]
 
 
-def _vocabulary(out: Path) -> Path:
-    """ORB words of a scene that is not measured here."""
+def provide_vocabulary(bench: Benchmark, out: Path) -> None:
+    """Where ORB-SLAM3 is installed without its words, give it those of a scene that is not measured."""
+    if not importlib.util.find_spec("pyorbslam3") or "ORB_VOCABULARY" in os.environ:
+        return
     path = out / "data" / "orb_vocabulary.txt"
     if not path.is_file():
-        bag, _ = simulated(replace(shrunk(PRESETS["room2"], 16, 60, 0.5), depth="exact"), out)
+        bag, _ = simulated(replace(shrunk(PRESETS["hall"], 16, 60, 0.5), depth="exact"), out)
         train([frame.image for frame in load_frames(bag)], path)
-    return path
+    os.environ["ORB_VOCABULARY"] = str(path)
+    bench.note("ORB-SLAM3 uses a small vocabulary trained on another scene; ORB_VOCABULARY names another.")
 
 
 def main() -> None:
@@ -141,9 +144,7 @@ def main() -> None:
     spec = replace(shrunk(PRESETS[args.scene], args.frames, args.stride, args.factor), depth="tof")
     bag, mesh = simulated(spec, args.out)
     frames = load_frames(bag)
-    if importlib.util.find_spec("pyorbslam3") and "ORB_VOCABULARY" not in os.environ:
-        os.environ["ORB_VOCABULARY"] = str(_vocabulary(args.out))
-        bench.note("ORB-SLAM3 uses a small vocabulary trained on another scene; ORB_VOCABULARY names another.")
+    provide_vocabulary(bench, args.out)
     bench.note(f"{len(frames)} RGB-D frames of '{args.scene}' at {spec.width}x{spec.height}, time-of-flight noise.")
     tables = {"tracking": side_by_side(OurTracker, ODOMETRY, frames, lambda make: measure_tracker(make, frames))}
     if not args.skip_fusion:

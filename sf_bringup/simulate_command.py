@@ -22,6 +22,7 @@ _CHANGES = (
     "lidar_hz",
     "seed",
     "supersampling",
+    "blur",
     "novel_views",
 )
 
@@ -44,6 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mesh", type=Path, help="also write the true surface as .ply, in the bag's map frame")
     for name in ("fps", "focal", "lidar-hz"):
         parser.add_argument(f"--{name}", type=float)
+    parser.add_argument(
+        "--blur", type=float, help="exposure in s: motion within it blurs the images, depth stays sharp"
+    )
     parser.add_argument("--depth", help="none, exact, structured_light or tof")
     parser.add_argument("--lidar", help="none, spinning64, spinning128 or rosette")
     parser.add_argument("--no-rgb", action="store_true", help="leave the colour images out")

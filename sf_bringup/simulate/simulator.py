@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +19,12 @@ from sf_bringup.simulate.trajectories import CameraPath, oval
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.io.sequence_writer import SequenceWriter
-from sf_interfaces.types import DepthMap, Float32, Float64, PointCloud
+from sf_interfaces.types import DepthMap, Float32, Float64, PointCloud, UInt8
 
 START_NS = 1_000_000_000_000
+_SKY = 1e4  # m
+_MOST = 90.0  # percent of the pixels
+_PARTS = ((-0.25, -0.25), (0.25, 0.25), (-0.25, 0.25), (0.25, -0.25))  # px, of a pixel's four quarters
 OPTICAL, LIDAR = "camera_optical_frame", "lidar"
 T_BASE_CAMERA_LINK = se3.exp(np.array([0.05, 0.0, 0.0, 0, 0, 0]))
 T_BASE_LIDAR = se3.exp(np.array([0.0, 0.02, 0.09, 0, 0, 0]))
@@ -59,12 +62,37 @@ class Simulator:
     def frame(self, index: int) -> tuple[np.ndarray, Float32, Float64]:
         """Image, exact depth and T_map_camera of one frame."""
         T = self.path.pose(index / self.spec.fps)
-        image, z = self.renderer.render(self.spec.camera, T, self.spec.supersampling)
+        image, z = self.renderer.render(self.spec.camera, T, 1 if self.spec.blur else self.spec.supersampling)
+        if self.spec.blur:
+            image = self._exposed(index / self.spec.fps, z)
         rng = np.random.default_rng([self.spec.seed, 1, index])
         if self.spec.image_noise:
             noise = rng.standard_normal(image.shape, dtype=np.float32) * np.float32(self.spec.image_noise)
             image = np.clip(image + noise + 0.5, 0, 255).astype(np.uint8)
         return image, z, T
+
+    def _exposed(self, middle: float, z: Float32) -> UInt8:
+        """Mean of the images during an exposure round ``middle`` s, each through another part of the pixels.
+
+        So many that from one to the next most pixels move by one or less.
+
+        Args:
+            z: depth at the middle, m.
+        """
+        spec, camera = self.spec, self.spec.camera
+        first, last = self.path.pose(middle + np.array([-0.5, 0.5]) * spec.blur)
+        grid = camera.pixel_grid()[::8, ::8].reshape(-1, 2)
+        points = camera.unproject(grid, np.nan_to_num(z[::8, ::8], nan=_SKY).ravel().astype(np.float64))
+        seen, _ = camera.project(se3.transform(se3.inverse(last) @ first, points))
+        moved = float(np.nanpercentile(np.linalg.norm(seen - grid, axis=1), _MOST))
+        count = len(_PARTS) * max(1, int(np.ceil(moved / len(_PARTS))))
+        total = np.zeros((spec.height, spec.width, 3))
+        for k in range(count):
+            du, dv = _PARTS[k % len(_PARTS)]
+            through = replace(camera, cx=camera.cx - du, cy=camera.cy - dv)
+            T = self.path.pose(middle + ((k + 0.5) / count - 0.5) * spec.blur)
+            total += self.renderer.render(through, T, 1)[0]
+        return np.asarray(np.round(total / count), np.uint8)
 
     def novel_pose(self, index: int) -> Float64:
         """T_map_camera of a view off the path: up to half the free distance away, turned by up to 20 degrees."""

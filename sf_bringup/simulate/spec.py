@@ -22,7 +22,7 @@ class SimulationSpec:
         scene: a name of ``SCENES``, or the path of a Gazebo ``.world`` file.
         frames, fps: length and rate of the camera; width, height, focal: px; path: None = the scene's.
         rgb, depth, lidar: the sensors; lidar_hz: sweeps per second; lidar_fov_deg: horizontal field.
-        image_noise: deviation in grey levels; supersampling: n x n rays on edges;
+        image_noise: deviation in grey levels; blur: exposure, s; supersampling: n x n rays on edges;
         ground_truth_depth: also write it; novel_views: images off the path to write under /ground_truth/novel.
     """
 
@@ -38,6 +38,7 @@ class SimulationSpec:
     lidar_hz: float = 10.0
     lidar_fov_deg: float = 360.0
     image_noise: float = 1.0
+    blur: float = 0.0
     supersampling: int = 2
     ground_truth_depth: bool = True
     novel_views: int = 0
@@ -53,6 +54,8 @@ class SimulationSpec:
             raise ConfigError(f"novel_views must lie between 0 and the {self.frames} frames, got {self.novel_views}")
         if min(self.frames, self.fps, self.lidar_hz, self.supersampling) <= 0 or self.image_noise < 0:
             raise ConfigError("frames, fps, lidar_hz and supersampling of a simulation must be positive")
+        if not 0 <= self.blur <= 1 / self.fps:
+            raise ConfigError(f"blur must lie between 0 and the {1 / self.fps:.4g} s of a frame, got {self.blur:g}")
 
     @property
     def camera(self) -> Camera:

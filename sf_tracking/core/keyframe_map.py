@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sf_interfaces.types import Camera, Float64, Keyframe, Scale
+from sf_interfaces.geometry import se3
+from sf_tracking.config import TrackingConfig
 from sf_tracking.core import sim3
 from sf_tracking.core.places import Features, Index, Place, features, place_of_keyframe
 from sf_tracking.core.pose_graph import Edges, optimise
@@ -65,6 +67,9 @@ class KeyframeMap:
         self._loops = loops
         self._index = Index()
         self._walked: list[float] = []  # length of the path up to each keyframe
+        self._measured: list[bool] = []  # whether it is known to have depth
+        self._gap = np.zeros(7)  # variances of the way to keyframes that were dropped since the last one
+        self._came: tuple[Float64, float] | None = None  # where the last one was, dropped or not, and the way to it
         self._parts: Iterator[None] = iter(())
         self._hints: list[tuple[Recognised, int]] = []  # sightings that agree so far, and the keyframes that had them
         self._news = False
@@ -82,13 +87,56 @@ class KeyframeMap:
         n, T = len(self), keyframe.T_map_camera
         self.stamps.append(keyframe.stamp_ns)
         self.S = np.concatenate([self.S, T[None]])
-        step = float(np.linalg.norm(self.S[n, :3, 3] - self.S[n - 1, :3, 3])) if n else 0.0
-        self._walked.append((self._walked[-1] if n else 0.0) + step)
+        before, way = self._came or (T[:3, 3], 0.0)
+        self._came = T[:3, 3], way + float(np.linalg.norm(T[:3, 3] - before))
+        self._walked.append(self._came[1])
+        self._measured.append(keyframe.depth is not None)
         if found is not None:
             self._tie(found.index, n, T, found.sigma, loop=True)
         elif n:
-            self._tie(n - 1, n, T, _odometry_sigma(keyframe), loop=False)
+            self._tie(n - 1, n, T, np.sqrt(_odometry_sigma(keyframe) ** 2 + self._gap), loop=False)
+        self._gap = np.zeros(7)
         self._parts = self._search(keyframe, n)
+
+    def knows(self, keyframe: Keyframe, config: TrackingConfig) -> bool:
+        """Whether one of the map's keyframes already sees what this one does: too little flow and enough overlap."""
+        cloud, camera, T = keyframe.landmarks, keyframe.camera, keyframe.T_map_camera
+        if cloud is None or not len(cloud) or not len(self):
+            return False
+        X = cloud.points.astype(np.float64)
+        uv, flow = camera.project(X)[0], config.keyframe_flow * camera.width
+        moved = se3.inverse(sim3.rigid(self.S)) @ T  # [N, 4, 4]
+        turn, reach = 2 * flow / camera.fx, 2 * flow / camera.fx * float(np.median(X[:, 2]))
+        near = (np.linalg.norm(moved[:, :3, 3], axis=1) < reach) & (moved[:, 2, 2] > np.cos(min(turn, np.pi)))
+        near &= np.array(self._measured) | (keyframe.depth is None)
+        for T_other_own in moved[near]:
+            at, z = camera.project(se3.transform(T_other_own, X))
+            with np.errstate(invalid="ignore"):
+                seen = (z > 0) & (at >= 0).all(axis=1) & (at < (camera.width, camera.height)).all(axis=1)
+            if seen.mean() >= config.keyframe_overlap and np.linalg.norm(at - uv, axis=1)[seen].mean() <= flow:
+                return True
+        return False
+
+    @property
+    def news(self) -> bool:
+        """Whether loops wait to take effect."""
+        self.complete()
+        return self._news
+
+    @property
+    def told(self) -> bool:
+        """Whether what was found out from the last keyframe speaks against the map as it is."""
+        return self.news or (bool(self._hints) and self._hints[-1][1] == len(self) - 1)
+
+    def drop(self) -> None:
+        """Forget the last keyframe, which told nothing; the next one is tied to the one before it."""
+        self.complete()
+        _, _, _, sigma, _ = self.edges.pop()
+        self._gap = np.asarray(sigma**2)
+        for values in (self.stamps, self.places, self._walked, self._measured):
+            values.pop()
+        self.S = self.S[:-1]
+        self._index.drop()
 
     def work(self) -> bool:
         """Do the next part of the search for a loop; True when nothing is left."""
@@ -223,6 +271,7 @@ class KeyframeMap:
         self.stamps, self.S, self.places, self.edges = stamps, S, places, edges
         steps = np.linalg.norm(np.diff(S[:, :3, 3], axis=0), axis=1)
         self._walked = np.r_[0.0, np.cumsum(steps)].tolist() if len(stamps) else []
+        self._measured = [False] * len(stamps)
         for place in places:
             self._index.add(place.descriptors)
 

@@ -19,6 +19,7 @@ from sf_tracking.core.update import View
 
 _LANDMARK_SIGMA = 0.2  # relative deviation of inverse depth up to which a patch is published as a landmark
 _SHEAR = (0.2, 5.0)  # change of a patch's area between two views, beyond which it is not looked for
+_WAITED = 2.0  # flow and loss of overlap, relative to what makes a keyframe, up to which depth is waited for
 _MIN_FLOW = 0.25  # of the flow that makes a keyframe: without it a loss of overlap is no reason for one
 
 
@@ -91,16 +92,30 @@ def reproject(keyframe: TrackedKeyframe, T_cw: Float64) -> Reprojection:
     return Reprojection(uv, warp, J_w, patches.w / z, visible)
 
 
-def wants_keyframe(config: TrackingConfig, keyframe: TrackedKeyframe, flow_px: Float64, share: float) -> bool:
+def wants_keyframe(
+    config: TrackingConfig, keyframe: TrackedKeyframe, flow_px: Float64, share: float, *, measured: bool = True
+) -> bool:
     """Enough motion for new information, or too little overlap to go on with the old patches.
 
     The overlap counts relative to the best since the keyframe was made, so that a scene half of which moves
-    does not make a keyframe of every frame.
+    does not make a keyframe of every frame. Where the keyframe has depth and the frame lacks it, a frame
+    that has it is waited for.
 
     Args:
         flow_px: displacement of the keyframe's patches found in the frame, [E] px.
         share: how many of its patches were found again, 0 to 1.
+        measured: the frame has depth.
     """
-    flow = float(flow_px.mean()) / (config.keyframe_flow * keyframe.camera.width) if len(flow_px) else 1.0
+    flow = float(flow_px.mean()) / (config.keyframe_flow * keyframe.camera.width) if len(flow_px) else 2 * _WAITED
     keyframe.best_share = max(keyframe.best_share, share)
-    return flow > 1.0 or (flow > _MIN_FLOW and share < config.keyframe_overlap * keyframe.best_share)
+    wait = 1.0 if measured or not keyframe.patches.measured.any() else _WAITED
+    return flow > wait or (flow > _MIN_FLOW and share < config.keyframe_overlap / wait * keyframe.best_share)
+
+
+def sees_the_same(config: TrackingConfig, keyframe: TrackedKeyframe, T_cw: Float64) -> bool:
+    """Whether a camera at T_cw sees so nearly what a keyframe does that it makes no other one."""
+    at = reproject(keyframe, T_cw)
+    if at.visible.mean() < config.keyframe_overlap:
+        return False
+    flow = np.linalg.norm(at.uv - keyframe.patches.uv, axis=1)[at.visible].mean()
+    return bool(flow <= config.keyframe_flow * keyframe.camera.width)

@@ -145,6 +145,12 @@ class Index:
         self._holders[words] += 1
         self._ends.append(begin + len(words))
 
+    def drop(self) -> None:
+        """Forget the place added last."""
+        end = self._ends.pop()
+        begin = self._ends[-1] if self._ends else 0
+        self._holders[self._words[begin:end]] -= 1
+
     def scores(self, descriptors: UInt8) -> Float64:
         """How much each place shares with the descriptors, [len(self)]; rare words count more."""
         if not self._ends:

@@ -50,6 +50,7 @@ class TrackingSession:
         self._held: deque[Keyframe] = deque(maxlen=_HELD)
         self._hint: tuple[Float64, Recognised] | None = None  # a start that waits for a second sighting
         self._sighted: int | None = None  # stamp of the keyframe that was looked for last
+        self._again: Keyframe | None = None  # the newest one, where it sees what an older one does
         self._lost = 0  # frames in a row
 
     def track(self, frame: Frame) -> TrackingUpdate:
@@ -81,8 +82,7 @@ class TrackingSession:
         poses = dict(self._poses)
         if self._start is not None and len(own := self._tracker.trajectory()):
             # A frame moves with the last final keyframe before it; those after the newest move as the tracker does.
-            finals = self._tracker.keyframe_trajectory().stamps_ns
-            finals = finals[len(finals) - len(self._anchors) :]
+            finals = np.array(self._map.stamps[len(self._map) - len(self._anchors) :], np.int64)
             owner = np.maximum(np.searchsorted(finals, own.stamps_ns, side="right") - 1, 0)
             owner[own.stamps_ns > (finals[-1] if len(finals) else -1)] = len(finals)
             S = np.array([*self._anchors, self._start])[owner]
@@ -99,18 +99,17 @@ class TrackingSession:
         self, update: TrackingUpdate, ended: tuple[Keyframe, ...], found: Recognised | None = None, *, end: bool = False
     ) -> TrackingUpdate:
         """The update in the map's frame; its keyframes enter the map, and loops take effect."""
-        start = self._start
-        assert start is not None
+        assert self._start is not None
         if not len(self._map):
             self._map.scale = update.scale
-        keyframes = tuple(self._moved(keyframe) for keyframe in update.keyframes)
-        for keyframe in keyframes:
-            self._map.add(keyframe, found)
-            self._anchors.append(start)
+        keyframes: tuple[Keyframe, ...] = ()
+        for keyframe in map(self._moved, update.keyframes):
+            keyframes += self._enter(keyframe, found)
             found = None
         if end:
             self._map.complete()
-        elif not keyframes:
+            keyframes += self._revisited()
+        elif not update.keyframes:
             self._map.work()
         correction = self._correct() if keyframes else None
         if correction is not None:
@@ -124,6 +123,30 @@ class TrackingSession:
             correction=correction,
             T_map_odom=self._T_map_odom,
         )
+
+    def _enter(self, keyframe: Keyframe, found: Recognised | None) -> tuple[Keyframe, ...]:
+        """A keyframe enters the map; those that are new to it.
+
+        One that sees what an older one does stays only if it tells something, which is known when the next one comes.
+        """
+        assert self._start is not None
+        new = self._revisited()
+        again = found is None and not self._map.news and self._map.knows(keyframe, self._config)
+        self._map.add(keyframe, found)
+        self._anchors.append(self._start)
+        if again:
+            self._again = keyframe
+            return new
+        return (*new, keyframe)
+
+    def _revisited(self) -> tuple[Keyframe, ...]:
+        """The keyframe that waits, if it told something; else the map forgets it."""
+        again, self._again = self._again, None
+        if again is None or self._map.told:
+            return () if again is None else (again,)
+        self._map.drop()
+        self._anchors.pop()
+        return ()
 
     def _moved(self, keyframe: Keyframe) -> Keyframe:
         """A keyframe of the tracker in the map's frame and unit."""

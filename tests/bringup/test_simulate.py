@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from sf_bringup.simulate import PRESETS, SimulationSpec, Simulator
+from sf_bringup.simulate.builder import SceneBuilder
+from sf_bringup.simulate.render import Renderer
 from sf_bringup.simulate.sensors import structured_light, time_of_flight
 from sf_bringup.simulate.simulator import T_CAMERA_LIDAR
 from sf_bringup.simulate.world import load_world
@@ -56,6 +58,42 @@ def test_deskewed_sweep_lies_on_the_surfaces(simulator: Simulator) -> None:
     T = simulator.path.pose(start + cloud.time_offset_ns * 1e-9) @ T_CAMERA_LIDAR
     world = np.einsum("nij,nj->ni", T[:, :3, :3], cloud.points) + T[:, :3, 3]
     assert np.percentile(simulator.renderer.clearance(world), 95) < 0.04
+
+
+class _Sideways:
+    """A camera that looks along +x and moves to -y, that is to its right, at ``speed`` m/s."""
+
+    def __init__(self, speed: float) -> None:
+        self._speed = speed
+
+    def pose(self, t: np.ndarray) -> np.ndarray:
+        T = np.broadcast_to(
+            np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]), (*np.shape(t), 4, 4)
+        )
+        T = T.copy()
+        T[..., 1, 3] = -self._speed * np.asarray(t)
+        return T
+
+
+def test_motion_during_the_exposure_blurs_an_edge_into_a_ramp_of_known_length() -> None:
+    spec = SimulationSpec("lounge", width=160, height=40, focal=100.0, image_noise=0.0, fps=10.0, blur=0.08)
+    builder = SceneBuilder(0)
+    white = builder.textures.add(np.full((8, 8, 3), 255, np.uint8))
+    for left, shade in ((0.0, 0.1), (-4.0, 0.7)):  # an edge straight ahead at t = 0, 2 m away
+        builder.quad((2.0, left, -2.0), (0, 4, 0), (0, 0, 4), white, tint=(shade,) * 3, gloss=0.0)
+    simulator, sharp = Simulator(spec), Simulator(replace(spec, blur=0.0))
+    for one in (simulator, sharp):
+        one.renderer, one.path = Renderer(builder.build(ambient=1.0)), _Sideways(4.0)  # type: ignore[assignment]
+    (image, z, T), (still, sharp_z, sharp_T) = simulator.frame(1), sharp.frame(1)
+    np.testing.assert_array_equal(z, sharp_z)
+    np.testing.assert_array_equal(T, sharp_T)
+    row, edge = image[20, :, 0].astype(float), 80 - 100 * 4.0 * 0.1 / 2.0  # px, in the middle of the exposure
+    dark, bright = still[20, 5, 0], still[20, 155, 0]
+    assert bright > dark + 80
+    ramp = np.clip((np.arange(160) + 0.5 - edge) / (100 * 4.0 * 0.08 / 2.0) + 0.5, 0, 1)
+    np.testing.assert_allclose((row - dark) / (float(bright) - dark), ramp, atol=0.06)
+    with pytest.raises(ConfigError, match="blur"):
+        replace(spec, blur=0.2)
 
 
 def test_structured_light_noise_grows_with_the_square_of_depth() -> None:
