@@ -106,7 +106,7 @@ def wants_keyframe(
         share: how many of its patches were found again, 0 to 1.
         measured: the frame has depth.
     """
-    flow = float(flow_px.mean()) / (config.keyframe_flow * keyframe.camera.width) if len(flow_px) else 2 * _WAITED
+    flow = float(flow_px.mean()) / (config.keyframe_flow * keyframe.camera.width) if len(flow_px) else 1.0
     keyframe.best_share = max(keyframe.best_share, share)
     wait = 1.0 if measured or not keyframe.patches.measured.any() else _WAITED
     return flow > wait or (flow > _MIN_FLOW and share < config.keyframe_overlap / wait * keyframe.best_share)
