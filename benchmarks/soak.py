@@ -54,7 +54,8 @@ def publish(path: Path, rate: float) -> None:
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import CameraInfo, Image
 
-    data = np.load(path, allow_pickle=False)
+    with np.load(path, allow_pickle=False) as stored:
+        data = dict(stored)
     rclpy.init()
     node = rclpy.create_node("soak_driver")
     color = node.create_publisher(Image, "/soak/color/image_raw", qos_profile_sensor_data)
@@ -144,6 +145,7 @@ def summarise(watch: Watch, begin: float, seconds: float) -> dict[str, Any]:
         "seconds": seconds,
         "first_pose_s": watch.first_pose - begin if watch.first_pose else None,
         "poses_heard": watch.poses,
+        "poses_per_s": watch.poses / max(begin + seconds - watch.first_pose, 1e-9) if watch.first_pose else 0.0,
         "frames_tracked": int(tracking.get("frames tracked", 0)),
         "images_received": int(tracking.get("image received", 0)),
         "keyframes_sent": int(tracking.get("keyframes", 0)),
