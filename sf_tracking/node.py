@@ -97,6 +97,7 @@ class TrackingNode(BlockNode):
             self.output(topics.TRACKING_POSE).publish(pose)
             self._publish_tf(frame.camera.frame_id, frame.stamp_ns, update.T_map_camera)
         self._send_keyframes(update)
+        self._save_state()
         due = self._path_stamp_ns is None or frame.stamp_ns - self._path_stamp_ns >= _PATH_EVERY_NS
         if due and self.wanted(topics.TRACKING_PATH):
             self._path_stamp_ns = frame.stamp_ns
@@ -107,8 +108,6 @@ class TrackingNode(BlockNode):
             publish_bundle(self, keyframe, TRACKED, set(TRACKED), correction)
             self.health.count("keyframes")
             self.sent_one(keyframe.stamp_ns)
-        if update.keyframes:
-            self._save_state()
 
     def _save_state(self) -> None:
         """A snapshot for a successor; a long trajectory is written less often, so that it never costs much."""
