@@ -1,9 +1,10 @@
 """All production lines in both engines, on a simulated recording and on real ones: line x data x engine x result.
 
-    python benchmarks/lines.py [--data FOLDER] [--work DIR] [--frames 24] [--only NAME ...] [--markdown lines.md]
+    python benchmarks/lines.py [--data FOLDER] [--work DIR] [--frames 24] [--real-frames 100] [--only NAME ...]
+                               [--markdown lines.md]
 
 One RGB-D and LiDAR recording is simulated, real ones are read from ``--data``; each line gets a copy that holds nothing
-but its own inputs (and the references), so the line is derived from the topics alone. Equality is the largest
+but its own inputs (and the references), so the line is derived from the topics alone; of a photo set eight images. Equality is the largest
 difference of positions between the engines. A line that this version cannot run is a row with the sentence it ends
 with.
 """
@@ -65,10 +66,11 @@ LINES = (
 
 
 # Name in the table -> folder below --data; each line runs on those that have what it needs.
+PHOTOS = 8  # images of a photo set, evenly from the recording
 REAL = {"7-Scenes": "rgbd_7scenes_redkitchen_000_199", "KITTI odometry": "rgbl_kitti_odometry04_000_017"}
 
 
-def recordings(work: Path, data: Path | None, frames: int) -> dict[str, Path]:
+def recordings(work: Path, data: Path | None, frames: int, real_frames: int) -> dict[str, Path]:
     """Name -> bag of everything there is to run on; what an earlier call left in ``work`` is used again."""
     bags = {"simulated": work / "simulated.mcap"}
     if not bags["simulated"].is_file():
@@ -79,7 +81,7 @@ def recordings(work: Path, data: Path | None, frames: int) -> dict[str, Path]:
         assert data is not None
         bags[name] = work / f"{folder}.mcap"
         if not bags[name].is_file():
-            convert(data / folder, bags[name], ReadOptions(limit=frames))
+            convert(data / folder, bags[name], ReadOptions(limit=real_frames))
     return bags
 
 
@@ -89,14 +91,24 @@ def suits(bag: Path, line: Line) -> bool:
         return all(topic in reader.topics for topic in (*line.topics, POSE))
 
 
+def skipped(whole: Path) -> frozenset[int]:
+    """Stamps of the images that a photo set of :data:`PHOTOS` leaves out."""
+    with BagReader(whole) as reader:
+        stamps = [raw.stamp_ns for raw in reader.messages([COLOR])]
+    return frozenset(stamps) - frozenset(stamps[:: -(-len(stamps) // PHOTOS)])
+
+
 def derive(whole: Path, line: Line, target: Path) -> Path:
     """A bag with the inputs of a line, the references, and the static transforms."""
     depth_only = COLOR not in line.topics
+    left_out = skipped(whole) if line.goal == "mvd" else frozenset()
     with BagReader(whole) as reader, SequenceWriter(target) as writer:
         # Where nothing better is known, a depth camera is the reference of what is estimated from images.
         wanted = line.topics if TRUE_DEPTH in reader.topics else {*line.topics, DEPTH}
         for raw in reader.messages():
             if raw.topic not in wanted and not raw.topic.startswith(("/ground_truth/", "/tf_static")):
+                continue
+            if raw.topic in (COLOR, INFO) and raw.stamp_ns in left_out:
                 continue
             topic = raw.topic.replace("/color/", "/depth/") if depth_only and raw.topic == INFO else raw.topic
             topic = TRUE_DEPTH if raw.topic == DEPTH and DEPTH not in line.topics else topic
@@ -188,13 +200,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--work", type=Path, default=Path("out/lines"))
     parser.add_argument("--data", type=Path, help="folder that holds the real recordings")
-    parser.add_argument("--frames", type=int, default=24)
+    parser.add_argument("--frames", type=int, default=24, help="of the simulated recording")
+    parser.add_argument("--real-frames", type=int, default=100, help="of each real one, at most")
     parser.add_argument("--only", nargs="+", default=[], help="names of lines, see LINES")
     parser.add_argument("--out", type=Path, default=Path("lines.json"))
     parser.add_argument("--markdown", type=Path)
     args = parser.parse_args()
     args.work.mkdir(parents=True, exist_ok=True)
-    bags = recordings(args.work, args.data, args.frames)
+    bags = recordings(args.work, args.data, args.frames, args.real_frames)
     rows: list[dict[str, Any]] = []
     for line, (data, whole) in product(LINES, bags.items()):
         if (args.only and line.name not in args.only) or not suits(whole, line):
