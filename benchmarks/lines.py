@@ -4,9 +4,9 @@
                                [--markdown lines.md]
 
 One RGB-D and LiDAR recording is simulated, real ones are read from ``--data``; each line gets a copy that holds nothing
-but its own inputs (and the references), so the line is derived from the topics alone; of a photo set eight images. Equality is the largest
-difference of positions between the engines. A line that this version cannot run is a row with the sentence it ends
-with.
+but its own inputs (and the references), so the line is derived from the topics alone; of a photo set eight images.
+Equality is the largest difference of positions between the engines. A line that this version cannot run is a row with
+the sentence it ends with.
 """
 
 # SPDX-License-Identifier: Apache-2.0

@@ -1,9 +1,10 @@
 """A live RGB-D line for a while: memory, drops and rates, as the nodes report them and as they are.
 
-    python benchmarks/soak.py [--seconds 120] [--rate 15] [--frames 100] [--width 640] [--out soak.json]
+    python benchmarks/soak.py [--seconds 120] [--rate 15] [--frames 100] [--width 640] [--kill-every 20] [--out FILE]
 
 A driver process publishes a simulated walk there and back again, with sensor-data QoS; ``sf up`` builds the line.
-Prints a table and writes JSON. Exit code 1: a keyframe was lost, or a node died.
+With --kill-every a node gets SIGKILL each so many seconds, tracking and recon in turn, and the pause until it publishes
+again is measured. Prints a table and writes JSON. Exit code 1: a keyframe was lost, or a node died unasked.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -87,6 +88,7 @@ class Watch:
         import rclpy
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import PoseStamped
+        from sensor_msgs.msg import PointCloud2
 
         rclpy.init()
         self._rclpy, self._out = rclpy, out
@@ -94,8 +96,11 @@ class Watch:
         self.values: dict[str, dict[str, str]] = {}
         self.memory: dict[str, list[tuple[float, float]]] = defaultdict(list)  # node -> (s, MB)
         self.poses, self.first_pose = 0, 0.0
+        self.outages: list[tuple[str, float]] = []  # node that was killed, s until it published again
+        self._killed: tuple[str, float] | None = None
         self._node.create_subscription(DiagnosticArray, "/diagnostics", self._report, 100)
         self._node.create_subscription(PoseStamped, "/sf/tracking/pose", self._pose, 1000)
+        self._node.create_subscription(PointCloud2, "/sf/recon/surface", lambda _: self._back("recon"), 10)
 
     def _report(self, msg: Any) -> None:
         for status in msg.status:
@@ -104,18 +109,35 @@ class Watch:
     def _pose(self, _: Any) -> None:
         self.first_pose = self.first_pose or time.monotonic()
         self.poses += 1
+        self._back("tracking")
 
-    def run(self, seconds: float, begin: float) -> None:
-        """Listen, and look at the memory now and then."""
+    def _back(self, name: str) -> None:
+        if self._killed is not None and self._killed[0] == name:
+            self.outages.append((name, time.monotonic() - self._killed[1]))
+            self._killed = None
+
+    def run(self, seconds: float, begin: float, kill_every: float = 0.0) -> None:
+        """Listen, look at the memory now and then, and kill a node every so many seconds (0: never)."""
         due, end = time.monotonic(), time.monotonic() + seconds
+        kill = time.monotonic() + kill_every if kill_every else end
         while time.monotonic() < end:
             self._rclpy.spin_once(self._node, timeout_sec=0.2)
             if time.monotonic() >= due:
                 due += SAMPLE_S
-                for name, megabytes in self._resident():
+                for name, _, megabytes in self._resident():
                     self.memory[name].append((time.monotonic() - begin, megabytes))
+            if time.monotonic() >= kill and kill < end - kill_every:
+                kill += kill_every
+                self._kill(("tracking", "recon")[len(self.outages) % 2])
 
-    def _resident(self) -> list[tuple[str, float]]:
+    def _kill(self, name: str) -> None:
+        for found, process, _ in self._resident():
+            if found == name:
+                self._killed = (name, time.monotonic())
+                os.kill(process, signal.SIGKILL)
+
+    def _resident(self) -> list[tuple[str, int, float]]:
+        """Node, process and MB of each of the line's processes."""
         found = []
         for entry in Path("/proc").iterdir():
             try:
@@ -123,7 +145,8 @@ class Watch:
                 if str(self._out).encode() in b" ".join(words) and b"--params-file" in words:
                     pages = int((entry / "statm").read_text().split()[1])
                     module = words[words.index(b"-m") + 1].decode()
-                    found.append((module.split(".")[0].removeprefix("sf_"), pages * 4096 / 1e6))
+                    name = module.split(".")[0].removeprefix("sf_")
+                    found.append((name, int(entry.name), pages * 4096 / 1e6))
             except (OSError, ValueError):
                 continue
         return found
@@ -152,6 +175,7 @@ def summarise(watch: Watch, begin: float, seconds: float) -> dict[str, Any]:
         "keyframes_taken": int(recon.get("keyframes", 0)),
         "keyframe_queue": int(recon.get("queue", 0)),
         "points": int(recon.get("points", 0)),
+        "outages": [{"killed": name, "seconds": seconds} for name, seconds in watch.outages],
         "memory": nodes,
         "drops": drops,
     }
@@ -176,10 +200,12 @@ def soak(args: argparse.Namespace) -> dict[str, Any]:
             watch.run(2.0, time.monotonic())
             begin = time.monotonic()
             children.append(subprocess.Popen(line, env=environment))
-            watch.run(args.seconds, begin)
+            watch.run(args.seconds, begin, args.kill_every)
             result = summarise(watch, begin, args.seconds)
             children[1].send_signal(signal.SIGINT)
             result["exit_code"] = children[1].wait(timeout=2 * SAVE_S)
+            stored = out / "trajectory.tum"
+            result["poses_in_trajectory"] = len(stored.read_text().splitlines()) if stored.is_file() else 0
             result["map_mb"] = (out / "map.sfmap").stat().st_size / 1e6 if (out / "map.sfmap").is_file() else 0.0
         finally:
             for child in children:
@@ -194,6 +220,7 @@ def main() -> int:
     parser.add_argument("--rate", type=float, default=15.0)
     parser.add_argument("--frames", type=int, default=100, help="of the walk, which is gone there and back again")
     parser.add_argument("--width", type=int, default=640)
+    parser.add_argument("--kill-every", type=float, default=0.0, metavar="S", help="SIGKILL a node each S seconds")
     parser.add_argument("--out", type=Path, default=Path("soak.json"))
     parser.add_argument("--publish", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -202,8 +229,10 @@ def main() -> int:
     result = soak(args)
     args.out.write_text(json.dumps(result, indent=2))
     for key, value in result.items():
-        if key not in ("memory", "drops"):
+        if key not in ("memory", "drops", "outages"):
             print(f"{key:18} {value}")
+    for outage in result["outages"]:
+        print(f"killed {outage['killed']:11} back after {outage['seconds']:.1f} s")
     for name, m in result["memory"].items():
         print(f"memory {name:11} {m['start_mb']:7.0f} -> {m['end_mb']:7.0f} MB ({m['mb_per_hour']:+.0f} MB/h)")
     for node, reasons in result["drops"].items():
