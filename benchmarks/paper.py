@@ -7,6 +7,9 @@ rows say how far the method can get, and are no baseline of the same run.
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 ROOMS = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 
 # ATE RMSE in cm, per room (Table "Camera Tracking Results on the Replica Dataset").
@@ -59,12 +62,36 @@ MVD = {
 }
 
 
+PAPER = "paper, Replica"
+# Column -> whether more is better.
+COLUMNS = {
+    "ATE cm": False,
+    "acc cm": False,
+    "comp cm": False,
+    "ratio %": True,
+    "PSNR": True,
+    "SSIM": True,
+    "LPIPS": False,
+}
+
+
+def columns(ours: Mapping[str, Any], paper: Mapping[str, Any]) -> list[dict[str, object]]:
+    """One row for each column of the paper's tables: our mean, the paper's over the same rooms, which is better."""
+    rows: list[dict[str, object]] = []
+    for name, more in COLUMNS.items():
+        row = {"input": ours["input"], "column": name, "this run": ours.get(name, "not measured"), "paper": paper[name]}
+        if name in ours:
+            row["better"] = "this run" if (ours[name] > paper[name]) == more else "paper"
+        rows.append(row)
+    return rows
+
+
 def room_row(room: str, kind: str) -> dict[str, object]:
     """The paper's numbers of one Replica room."""
     k = ROOMS.index(room)
     tables = {"ATE cm": ATE, "acc cm": ACCURACY, "comp cm": COMPLETION, "ratio %": RATIO, "PSNR": PSNR, "SSIM": SSIM}
     numbers = {name: table[kind][k] for name, table in tables.items()}
-    return {"room": room, "input": kind, "system": "paper, Replica", **numbers, "LPIPS": LPIPS[kind][k]}
+    return {"room": room, "input": kind, "system": PAPER, **numbers, "LPIPS": LPIPS[kind][k]}
 
 
 def other_rows() -> list[dict[str, object]]:

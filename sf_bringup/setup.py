@@ -7,6 +7,8 @@ from setuptools import find_packages, setup
 
 NAME = "sf_bringup"
 
+LAYOUTS = ("launch", "config", "rviz", "foxglove")
+
 setup(
     name=NAME,
     version="0.1.0",
@@ -17,7 +19,10 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        *((f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*"))) for folder in ("launch", "config", "rviz")),
+        *(
+            (f"share/{NAME}/{folder}", sorted(glob(f"{folder}/*")))
+            for folder in ("launch", "config", "rviz", "foxglove")
+        ),
     ],
     entry_points={
         # sf_recon and sf_tracking are ament_cmake packages, which declare no entry points of their own.

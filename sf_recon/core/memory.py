@@ -12,13 +12,12 @@ from sf_recon.core.color_field import ColorField
 from sf_recon.core.neural_points import NeuralPoints
 from sf_recon.core.trainer import Trainer
 
-GRID_BYTES = 38  # per point in the search grid, measured at 1 M points: coordinates, id, free places, table of cells
 _ROOM = 0.9  # of the budget remains after an eviction, so that not every keyframe evicts
 
 
 def points_bytes(points: NeuralPoints, field: ColorField, trainer: Trainer) -> int:
     """Memory of positions, deviations, features, moments and search grids of all levels."""
-    own = sum(level.points.nbytes + level.sigmas.nbytes + GRID_BYTES * len(level) for level in points.levels)
+    own = sum(level.points.nbytes + level.sigmas.nbytes + level.grid.nbytes for level in points.levels)
     return own + sum(f.nbytes for f in field.features) + sum(adam.nbytes for adam in trainer.rows)
 
 

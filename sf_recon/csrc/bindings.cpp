@@ -287,6 +287,7 @@ NB_MODULE(_native, m) {
     nb::class_<sf::PointGrid>(m, "PointGrid")
         .def(nb::init<float>(), nb::arg("cell_size"))
         .def("__len__", &sf::PointGrid::size)
+        .def_prop_ro("nbytes", &sf::PointGrid::nbytes)
         .def("add_spaced", &add_spaced, nb::arg("points"), nb::arg("spacing"), nb::arg("copy_radius"))
         .def("add", &add, nb::arg("points"))
         .def("knn", &knn, nb::arg("queries"), nb::arg("k"), nb::arg("radius"), nb::arg("threads") = 0);

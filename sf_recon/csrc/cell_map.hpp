@@ -49,6 +49,7 @@ class CellMap {
     }
 
     size_t size() const { return count_; }
+    size_t nbytes() const { return slots_.capacity() * sizeof(Slot); }
 
    private:
     struct Slot {

@@ -16,37 +16,66 @@ struct Fragment {  // a visible point: continuous pixel, depth, row in the cloud
     int32_t id;
 };
 
-struct Bins {
-    std::unique_ptr<Fragment[]> fragments;  // grouped by tile, in any order within a tile
-    size_t capacity = 0;
-    std::vector<size_t> begin;  // [tiles + 1]
-    int tiles_x = 0, tiles_y = 0;
+struct Visible {
+    Fragment fragment;
+    uint32_t columns, rows;  // of tiles, inclusive: first | last << 16
+
+    int x0() const { return columns & 0xffff; }
+    int x1() const { return columns >> 16; }
+    int y0() const { return rows & 0xffff; }
+    int y1() const { return rows >> 16; }
+};
+
+// What one thread has found, by tile, in lots of equal size. Points are written once, without counting them first.
+class Lots {
+   public:
+    void clear(size_t tiles);
+
+    void add(size_t tile, const Fragment& fragment) {
+        Fragment*& end = end_[tile];
+        if (reinterpret_cast<uintptr_t>(end) % sizeof(Lot) == 0) end = fresh(tile);  // full, or none yet
+        *end++ = fragment;
+    }
+
+    // Appends the fragments of a tile, in any order.
+    void copy_to(size_t tile, std::vector<Fragment>& out) const;
+
+   private:
+    static constexpr size_t kLot = 64, kPage = 256;
+    struct alignas(kLot * sizeof(Fragment)) Lot {
+        Fragment fragments[kLot];
+    };
+
+    Fragment* fresh(size_t tile);
+    const Fragment* at(int32_t lot) const { return pages_[lot / kPage][lot % kPage].fragments; }
+
+    std::vector<std::unique_ptr<Lot[]>> pages_;  // kept from frame to frame
+    std::vector<int32_t> before_;                // the lot before each in its tile, or -1
+    std::vector<int32_t> newest_;                // [tiles] lot, or -1
+    std::vector<Fragment*> end_;                 // [tiles] where the next fragment goes
 };
 
 // Memory that a thread keeps from frame to frame.
 class Binner {
    public:
-    const Bins& bin(const float* points, size_t n, const RasterSpec& spec, int threads);
+    void bin(const float* points, size_t n, const RasterSpec& spec, int threads);
+    int tiles_x() const { return tiles_x_; }
+    int tiles() const { return tiles_x_ * tiles_y_; }
+    void fragments(int tile, std::vector<Fragment>& out) const;
 
    private:
-    struct Visible {
-        Fragment fragment;
-        uint16_t x0, x1, y0, y1;  // tiles, inclusive
+    struct Team {  // of one thread
+        Lots lots;
+        std::vector<Visible> wide;  // set aside: each may cover a whole tile
     };
 
-    void project(const float* points, size_t first, size_t last, const RasterSpec& s, int chunk);
-    void count(int chunk);
-    bool bound_tiles(const RasterSpec& s, int chunks);
-    size_t place(int chunks);
-    void scatter(int chunk);
+    void project(const float* points, size_t first, size_t last, const RasterSpec& s, Team& team) const;
+    void bound_tiles(const RasterSpec& s);
+    void add_wide(Team& team) const;
 
-    Bins bins_;
-    std::unique_ptr<Visible[]> visible_;
-    size_t capacity_ = 0;
-    std::vector<size_t> first_, found_;  // of the visible points of each chunk
-    std::vector<size_t> offset_;         // [chunks, tiles] counts, then write positions
-    std::vector<uint8_t> covers_;        // per chunk: some point covers a whole tile
-    std::vector<float> bound_;           // [tiles] nothing behind it can be drawn
+    int tiles_x_ = 0, tiles_y_ = 0;
+    std::vector<Team> teams_;
+    std::vector<float> bound_;  // [tiles] no wide point behind it can be drawn
 };
 
 }  // namespace sf

@@ -30,6 +30,7 @@ struct Item {  // a fragment to be sorted
 };
 
 struct TileScratch {
+    std::vector<Fragment> fragments;
     std::vector<uint32_t> windows;
     std::vector<float> splats;  // [fragments, 4] u, v, z, -1 / (sigma * half-width^2) along x
     std::vector<Item> items;
@@ -86,17 +87,37 @@ SF_INLINE int bucket_by_depth(const Fragment* fragments, size_t n, TileScratch& 
     return buckets;
 }
 
-// One fragment into the lists of the pixels it covers that are still open. A word of 64 bits holds four rows.
-SF_INLINE void draw(const Item& item, int k, float gap, TileScratch& t) {
+// Pixels of four rows of the tile, one bit each, that a fragment covers.
+SF_INLINE uint64_t covered(const Item& item, int word) {
     const uint64_t columns = (item.window & 0xffff) * 0x0001000100010001ull;
     const int y0 = item.window >> 16 & 255, y1 = item.window >> 24;
+    const int first = std::max(y0 - 4 * word, 0), last = std::min(y1 - 4 * word, 3);
+    return columns & (~0ull << (16 * first)) & (~0ull >> (16 * (3 - last)));
+}
+
+SF_INLINE int first_word(const Item& item) { return item.window >> 18 & 63; }
+SF_INLINE int last_word(const Item& item) { return item.window >> 26; }
+
+// Leaves out the fragments that cover no open pixel; returns the end of the others.
+SF_INLINE Item* keep_open(Item* first, Item* last, const TileScratch& t) {
+    Item* kept = first;
+    for (; first < last; ++first) {
+        const int head = first_word(*first), tail = last_word(*first);
+        uint64_t open = (t.open[head] & covered(*first, head)) | (t.open[tail] & covered(*first, tail));
+        for (int word = head + 1; word < tail; ++word) open |= t.open[word] & covered(*first, word);
+        *kept = *first;
+        kept += open != 0;
+    }
+    return kept;
+}
+
+// One fragment into the lists of the pixels it covers that are still open.
+SF_INLINE void draw(const Item& item, int k, float gap, TileScratch& t) {
     const float z = item.z();
     uint32_t* list = t.list.data();
-    for (int word = y0 / 4; word <= y1 / 4; ++word) {
-        const int first = std::max(y0 - 4 * word, 0), last = std::min(y1 - 4 * word, 3);
-        const uint64_t rows = (~0ull << (16 * first)) & (~0ull >> (16 * (3 - last)));
+    for (int word = first_word(item); word <= last_word(item); ++word) {
         uint64_t complete = 0;
-        for (uint64_t bits = t.open[word] & columns & rows; bits; bits &= bits - 1) {
+        for (uint64_t bits = t.open[word] & covered(item, word); bits; bits &= bits - 1) {
             const int bit = __builtin_ctzll(bits), p = 64 * word + bit, count = t.count[p];
             const int taken = z - t.last_z[p] < gap;
             list[count * kPixels + p] = item.local;
@@ -132,6 +153,7 @@ SF_SIMD void fill_lists(const RasterSpec& s, const Fragment* fragments, size_t n
     const int buckets = bucket_by_depth(fragments, n, t, begin);
     for (int b = 0; b < buckets && (t.open[0] | t.open[1] | t.open[2] | t.open[3]); ++b) {
         Item *first = t.items.data() + begin[b], *last = t.items.data() + begin[b + 1];
+        if (last - first > 1) last = keep_open(first, last, t);
         if (last - first > 24)
             std::sort(first, last);
         else if (last - first > 1)
@@ -225,11 +247,12 @@ void write_row(const RasterSpec& s, const float* normals, const Fragment* fragme
         blend_normals(s, normals, fragments, t, row * kTile + i, out.normal + 3 * (at + i));
 }
 
-void draw_tile(const RasterSpec& s, const float* normals, const Bins& bins, int tile, TileScratch& t,
+void draw_tile(const RasterSpec& s, const float* normals, const Binner& bins, int tile, TileScratch& t,
                const RasterImages& out) {
-    const int left = tile % bins.tiles_x * kTile, top = tile / bins.tiles_x * kTile;
-    const Fragment* fragments = bins.fragments.get() + bins.begin[tile];
-    fill_lists(s, fragments, bins.begin[tile + 1] - bins.begin[tile], left, top, t);
+    const int left = tile % bins.tiles_x() * kTile, top = tile / bins.tiles_x() * kTile;
+    bins.fragments(tile, t.fragments);
+    const Fragment* fragments = t.fragments.data();
+    fill_lists(s, fragments, t.fragments.size(), left, top, t);
     for (int v = top; v < std::min(top + kTile, s.height); ++v) {
         RowMeans sums;
         resolve_row(s, left, v - top, v, t, sums);
@@ -242,8 +265,9 @@ void draw_tile(const RasterSpec& s, const float* normals, const Bins& bins, int 
 
 void rasterize(const float* points, const float* normals, size_t n, const RasterSpec& s, const RasterImages& wanted) {
     const int threads = s.threads > 0 ? s.threads : omp_get_max_threads();
-    thread_local Binner binner;  // a render loop does not pay for fresh memory in every frame
-    const Bins& bins = binner.bin(points, n, s, threads);
+    thread_local Binner own;  // a render loop does not pay for fresh memory in every frame
+    Binner& bins = own;  // the team of threads below has none of its own
+    bins.bin(points, n, s, threads);
     RasterImages out = wanted;
     std::unique_ptr<float[]> position;
     if (out.normal && !normals && !out.position) {
@@ -256,7 +280,7 @@ void rasterize(const float* points, const float* normals, size_t n, const Raster
         scratch.list.resize(static_cast<size_t>(s.k_ray + 1) * kPixels);
         scratch.weight.resize(static_cast<size_t>(s.k_ray) * kTile);
 #pragma omp for schedule(dynamic, 8)
-        for (int tile = 0; tile < bins.tiles_x * bins.tiles_y; ++tile) draw_tile(s, normals, bins, tile, scratch, out);
+        for (int tile = 0; tile < bins.tiles(); ++tile) draw_tile(s, normals, bins, tile, scratch, out);
     }
     if (out.normal && !normals) normals_of(out.position, s.width, s.height, s.layer_gap, threads, out.normal);
 }

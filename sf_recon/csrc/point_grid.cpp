@@ -122,6 +122,11 @@ int32_t PointGrid::new_block(int32_t next) {
     return b;
 }
 
+size_t PointGrid::nbytes() const {
+    const size_t blocks = pages_.size() * kPage * sizeof(Block) + next_.capacity() * sizeof(int32_t) + filled_.capacity();
+    return blocks + bricks_.capacity() * sizeof(Brick) + index_.nbytes();
+}
+
 void PointGrid::add(const float* p) {
     const Cell cell = cell_of(p, inverse_);
     const size_t brick = index_.insert(brick_of(cell));

@@ -46,6 +46,7 @@ class PointGrid {
     bool collect(const float* point, float radius, Candidates& out) const;
 
     int32_t size() const { return count_; }
+    size_t nbytes() const;  // of memory, free places included
     float cell_size() const { return size_; }
     std::shared_mutex& mutex() const { return mutex_; }
 

@@ -1,14 +1,17 @@
-"""The launch file, the YAML of each mode and the RViz layout fit the program as it is."""
+"""The launch file, the YAML of each mode and the layouts of RViz and Foxglove fit the program as it is."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
 import ast
+import json
+import re
 import sys
 import types
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -72,3 +75,22 @@ def test_rviz_shows_topics_that_exist_with_the_quality_they_have() -> None:
     for name, display in shown.items():
         if display["Durability Policy"] == "Transient Local":
             assert table[name].qos in (topics.Qos.LATCHED, topics.Qos.MAP, topics.Qos.KEYFRAME)
+
+
+def test_foxglove_shows_topics_that_the_nodes_publish() -> None:
+    layout = json.loads((HERE / "foxglove" / "scenefactory.json").read_text())
+    panels: dict[str, dict[str, Any]] = layout["configById"]
+    assert sorted(_leaves(layout["layout"])) == sorted(panels), "a panel without a place, or a place without a panel"
+    shown = set(panels["3D!map"]["topics"]) | set(re.findall(r'": "(/[a-z_/]+)', json.dumps(panels)))
+    published = {topic.name: topic for topic in topics.TABLE if topic not in (*topics.INPUTS, topics.VIEW_POSE)}
+    assert len(shown) > 8 and shown <= set(published)
+    fields = [path["value"].removeprefix(topics.TRACKING_POSE.name) for path in panels["Plot!position"]["paths"]]
+    message = topics.TRACKING_POSE.type.replace("/msg/", "/")
+    assert message == "geometry_msgs/PoseStamped" and fields == [f".pose.position.{axis}" for axis in "xyz"]
+    clouds = {name for name, given in panels["3D!map"]["topics"].items() if given.get("colorMode") == "rgb"}
+    assert clouds == {topics.SURFACE.name, topics.DENSE_POINTS.name}
+
+
+def _leaves(place: str | dict[str, Any]) -> list[str]:
+    """The panels of a layout."""
+    return [place] if isinstance(place, str) else _leaves(place["first"]) + _leaves(place["second"])
