@@ -18,7 +18,7 @@ from rclpy.node import Node
 from sf_bringup.launcher import Process, stop_all
 from sf_bringup.launcher_env import node_environment
 from sf_bringup.line import Line
-from sf_bringup.pipeline import untracked
+from sf_bringup.pipeline import IMAGE_SET, untracked
 from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.progress import Progress
@@ -27,7 +27,7 @@ from sf_bringup.wiring import NodeLaunch, launches
 from sf_interfaces import topics
 from sf_interfaces.blocks import Quantity
 from sf_interfaces.config import ConfigFile
-from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.errors import FormatError, SceneFactoryError
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.qos import qos_profile
 
@@ -127,6 +127,8 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
             stop_all([*graph.processes, *helpers])  # at once: each may take its whole patience
     for sentence in watch.errors:
         print(f"sf: {sentence}", file=sys.stderr)
+    if made.ids == (IMAGE_SET,) and not (folder.path / "trajectory.tum").is_file():
+        raise FormatError("; ".join(watch.errors) or f"no image of {given.bag} got depth")
     poses = folder.path / "trajectory.tum"
     if poses.is_file() and not poses.stat().st_size:
         raise untracked(given)

@@ -24,10 +24,10 @@ REDUCTION = 4  # the sweep sees every image at this fraction of its size
 _STEP = 0.75  # px of the reduced image between two planes, in the source that moves most
 _FEWEST, _MOST = 16, 160  # planes
 _NEAREST, _FARTHEST = (1.5, 5.0), 0.5  # range of the sweep: times the nearest, the median, the farthest seen so far
-_WINDOW = (5, 5)  # px that are compared
+_WINDOW = (3, 3)  # px that are compared
 _NOISE = 4.0  # grey levels^2 of variance that mean no texture
 _UNSEEN = 0.6  # dissimilarity of a source that does not see the point: that of a poor match
-_BEND, _BREAK = 0.06, 1.2  # cost of a neighbour on the next plane, and on any other
+_BEND, _BREAK = 0.06, 2.4  # cost of a neighbour on the next plane, and on any other
 _EDGE = 8.0  # grey levels at which a break costs half
 _MIN_Z = 0.05  # of the reference depth
 

@@ -158,6 +158,10 @@ class BlockNode(LifecycleNode):
         self._sent += 1
         self._publish_state(_RUNNING, stamp_ns)
 
+    def still_working(self) -> None:
+        """Let the stream's state say so in the course of a long computation that has sent nothing yet."""
+        self._publish_state(_RUNNING, 0)
+
     def enqueue(self, kind: str, data: Any) -> None:
         """Give the worker a job of its own kind (not a serialised message)."""
         self._inbox.put(kind, data)
