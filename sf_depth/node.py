@@ -138,7 +138,7 @@ class DepthNode(BlockNode):
 
     def _estimate_all(self, images: ImageSet) -> None:
         """Depth and pose of all images, sent and saved."""
-        found = images.finish(lambda done: self.still_working())
+        found = images.finish(lambda done: self.sent(0, count=0))
         for keyframe in found.keyframes:
             for bundle, parts in _SET_BUNDLES:
                 publish_bundle(self, keyframe, bundle, parts)
@@ -165,7 +165,7 @@ class DepthNode(BlockNode):
         self.health.count("keyframes completed")
         if self.wanted(topics.DENSE_POINTS):
             self.output(topics.DENSE_POINTS).publish(messages.encode_cloud(messages.rclpy_factory, _points(dense)))
-        self.sent_one(dense.stamp_ns)
+        self.sent(dense.stamp_ns)
 
 
 def _points(keyframe: Keyframe) -> PointCloud:

@@ -169,8 +169,6 @@ class FrameAssembler:
             return ""
         item = self._pending[0]
         late = [name for name, s in self._streams.items() if not s.passed(item.key)]
-        if not self.config.camera:
-            return ""
         if item.frame_id not in self._cameras:
             return self._no_camera(item.frame_id)
         if not self._cameras[item.frame_id].settled(item.key.stamp_ns, self._leading_ns):

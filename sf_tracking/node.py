@@ -106,7 +106,7 @@ class TrackingNode(BlockNode):
         for keyframe, correction in update.corrected_keyframes():
             publish_bundle(self, keyframe, TRACKED, set(TRACKED), correction)
             self.health.count("keyframes")
-            self.sent_one(keyframe.stamp_ns)
+            self.sent(keyframe.stamp_ns)
         if update.keyframes:
             self._save_state()
 
