@@ -18,7 +18,7 @@ from rclpy.node import Node
 from sf_bringup.launcher import Process, stop_all
 from sf_bringup.launcher_env import node_environment
 from sf_bringup.line import Line
-from sf_bringup.pipeline import untracked
+from sf_bringup.pipeline import IMAGE_SET, untracked
 from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.progress import Progress
@@ -27,7 +27,7 @@ from sf_bringup.wiring import NodeLaunch, launches
 from sf_interfaces import topics
 from sf_interfaces.blocks import Quantity
 from sf_interfaces.config import ConfigFile
-from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.errors import FormatError, SceneFactoryError
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.qos import qos_profile
 
@@ -36,6 +36,7 @@ _DISCOVERY_S = 60.0
 _IN_FLIGHT = 24  # images: more than one LiDAR period at 30 Hz, little enough to bound memory
 _RECORDED = [t.name for t in topics.TABLE if t.name.startswith("/sf/") and t not in topics.INPUTS]
 _ALSO_RECORDED = [topics.TF.name, topics.TF_STATIC.name, topics.DIAGNOSTICS.name]
+_DIAGNOSTICS_S = 5.0
 _STALL_S = 180.0  # without any news from any node a replay has hung
 
 
@@ -109,6 +110,11 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
     out, compressed = str(folder.path.resolve()), given.mapping.compressed
     line = launches(made, given.mapping.roles, config, lossless=rate == 0, out=out, compressed=compressed)
     environment = node_environment()
+
+    def estimated() -> bool:
+        """An image set is all or nothing: without depth of any image the node leaves no file."""
+        return made.ids != (IMAGE_SET,) or (folder.path / "trajectory.tum").is_file()
+
     logs = folder.path / "log"
     with _parent_node() as node:
         watch = _Watch(node, line)
@@ -121,12 +127,16 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
             player = Process("player", _play_command(given, line, rate), logs / "player.log", environment)
             helpers.append(player)
             _wait(node, watch, graph, player, recorder, line, given)
+            if not estimated():
+                _hear_why(node, watch)
             graph.stop()
             _finish_recording(recorder)
         finally:
             stop_all([*graph.processes, *helpers])  # at once: each may take its whole patience
     for sentence in watch.errors:
         print(f"sf: {sentence}", file=sys.stderr)
+    if not estimated():
+        raise FormatError("; ".join(watch.errors) or f"no image of {given.bag} got depth")
     poses = folder.path / "trajectory.tum"
     if poses.is_file() and not poses.stat().st_size:
         raise untracked(given)
@@ -188,6 +198,13 @@ def _wait(
                 raise SceneFactoryError(
                     f"no news from {', '.join(waiting)} for {_STALL_S:g} s; see the logs beside the result"
                 )
+
+
+def _hear_why(node: Node, watch: _Watch) -> None:
+    """Errors travel with the diagnostics, which come once a second and so after the end of a stream."""
+    deadline = time.monotonic() + _DIAGNOSTICS_S
+    while not watch.errors and time.monotonic() < deadline:
+        rclpy.spin_once(node, timeout_sec=0.1)
 
 
 def logs_of(graph: Line, name: str) -> Path:

@@ -13,7 +13,6 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from sf_bringup import photo_set
 from sf_bringup.planner import Plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.progress import Progress
@@ -33,6 +32,7 @@ from sf_interfaces.timing import Timings
 from sf_interfaces.types import Float64, Frame, Keyframe, Trajectory
 
 PARTS_GROUP = "scenefactory.parts"
+IMAGE_SET = "depth:mvd"  # the one-shot goal: all images at once
 
 
 def make_part(block_id: str, config: ConfigFile) -> Any:
@@ -177,8 +177,8 @@ def run_inproc(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFil
     """
     if rate:
         raise ConfigError("--rate plays live through the graph; add --engine ros")
-    if photo_set.is_photo_set(made):
-        return _run_photo_set(folder, given, made, config)
+    if made.ids == (IMAGE_SET,):
+        return _run_image_set(folder, given, made, config)
     inputs = _inputs(given, made, config)
     with (
         BagReader(given.bag) as reader,
@@ -234,24 +234,23 @@ def _unused(given: BagInput, inputs: SensorInputs) -> FormatError:
     return FormatError(f"no frame of {given.bag} could be used: {reasons}")
 
 
-def _run_photo_set(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile) -> dict[str, int]:
-    """The one-shot goal: all images at once."""
-    reasons: dict[str, int] = {}
-    if Quantity.INTRINSICS in made.available:
-        inputs = _inputs(given, made, config)
-        with BagReader(given.bag) as reader:
-            for message in _messages(reader, given):
-                inputs.push(*message)
-        inputs.assembler.end()
-        frames = list(inputs.assembler.ready())
-        reasons = dict(inputs.assembler.reasons)
-        if not frames:
-            raise _unused(given, inputs)
-    else:
-        frames = photo_set.frames_without_camera(given)
+def _run_image_set(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile) -> dict[str, int]:
+    """All images at once, with the intrinsics and poses there are."""
+    inputs = _inputs(given, made, config)
+    with BagReader(given.bag) as reader:
+        for message in _messages(reader, given):
+            inputs.push(*message)
+    inputs.assembler.end()
+    frames = list(inputs.assembler.ready())
+    if not frames:
+        raise _unused(given, inputs)
     with ResultWriter(SequenceWriter(folder.result)) as writer, Progress("estimating", "images") as progress:
-        progress.update(0, len(frames))
-        return reasons | photo_set.estimate(make_part(photo_set.MVD, config), frames, folder, writer)
+        found = make_part(IMAGE_SET, config).estimate(frames, lambda done: progress.update(done, len(frames)))
+        for keyframe in found.keyframes:
+            writer.keyframe(keyframe)
+            writer.dense(keyframe)
+    found.save_products(folder.path)
+    return dict(inputs.assembler.reasons) | found.reasons
 
 
 def _advance(line: ProductionLine, inputs: SensorInputs) -> int:

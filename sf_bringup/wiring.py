@@ -11,7 +11,6 @@ from sf_bringup.planner import INPUT, Plan, Step
 from sf_interfaces import topics
 from sf_interfaces.blocks import Quantity
 from sf_interfaces.config import ConfigFile
-from sf_interfaces.errors import PlanError
 
 Q = Quantity
 _ROLE_TOPIC = {
@@ -49,6 +48,7 @@ def sync_values(plan: Plan, roles: Mapping[str, str], step: Step) -> dict[str, b
     uses = frozenset(step.spec.requires | step.spec.optional)
     return {
         "image": True,
+        "camera": Q.INTRINSICS in given | step.spec.requires,
         "depth": "depth" in roles and bool(uses & {Q.DEPTH, Q.SPARSE_DEPTH}),
         "lidar": "lidar" in roles and Q.DEPTH not in given and bool(uses & {Q.SPARSE_DEPTH}),
         "pose": Q.GIVEN_POSE in given,
@@ -74,9 +74,6 @@ def launches(
         compressed: roles whose topic carries CompressedImage.
     """
     plan.check_runnable()
-    first = plan.steps[0]
-    if first.spec.id == "depth:mvd":
-        raise PlanError("an image set is estimated at once, in one process: leave --engine ros out")
     streams = [_STREAM[role] for role in roles if role in compressed]
     return tuple(_launch(plan, step, roles, config, lossless, out, streams) for step in plan.steps)
 

@@ -54,7 +54,7 @@ class FlexionNode(BlockNode):
             image = self._flexion(frame.depth, frame.camera)
             sent = messages.encode_image(messages.rclpy_factory, image, frame.stamp_ns, frame.camera.frame_id)
             self.output(topics.FLEXION_IMAGE).publish(sent)
-            self.sent_one(frame.stamp_ns)
+            self.sent(frame.stamp_ns)
 
 
 def main() -> int:

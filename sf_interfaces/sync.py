@@ -32,6 +32,7 @@ class SyncConfig:
     """Which streams make a frame, and how close in time they have to be."""
 
     image: bool = option(True, "frames carry an image; without it the depth image leads (depth-only input)")
+    camera: bool = option(True, "frames carry intrinsics; without them images are taken as they are")
     depth: bool = option(False, "frames carry a dense depth image")
     lidar: bool = option(False, "frames carry a LiDAR sweep")
     pose: bool = option(False, "frames carry a given pose; frames without one are dropped")
@@ -198,7 +199,7 @@ class FrameAssembler:
             queue.append(StreamItem(key, value, frame_id.lstrip("/")))
 
     def _decidable(self, item: StreamItem) -> bool:
-        if self._ended or len(self._pending) > self.config.max_pending:
+        if self._ended or not self.config.camera or len(self._pending) > self.config.max_pending:
             return True
         complete = (
             item.frame_id in self._cameras
@@ -213,6 +214,8 @@ class FrameAssembler:
         return newest.epoch > item.key.epoch or late_ns > self.config.max_wait_s * _S
 
     def _assemble(self, item: StreamItem) -> Frame | None:
+        if not self.config.camera:  # nothing can be placed relative to an unknown camera
+            return Frame(item.key.stamp_ns, None, item.value)
         if item.frame_id not in self._cameras:
             raise CalibrationError(self._no_camera(item.frame_id))
         camera, distortion = self._calibrated(item)

@@ -135,7 +135,7 @@ class ReconNode(BlockNode):
         self.health.count("keyframes")
         self.health.count("points", len(added))
         self._publish_surface(added)
-        self.sent_one(keyframe.stamp_ns)
+        self.sent(keyframe.stamp_ns)
         self._unsaved += 1
         if self._unsaved >= _SNAPSHOT_KEYFRAMES and (path := self.state("recon.sfmap")) is not None:
             with self._lock, replace_file(path) as draft:

@@ -107,7 +107,7 @@ class TrackingNode(BlockNode):
         for keyframe, correction in update.corrected_keyframes():
             publish_bundle(self, keyframe, TRACKED, set(TRACKED), correction)
             self.health.count("keyframes")
-            self.sent_one(keyframe.stamp_ns)
+            self.sent(keyframe.stamp_ns)
 
     def _save_state(self) -> None:
         """A snapshot for a successor; a long trajectory is written less often, so that it never costs much."""

@@ -21,6 +21,8 @@ from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.ros.messages import decode_depth, to_ns
+from tests.bringup.test_photo_set import photos
+from tests.depth.views import Views, room
 from tests.tracking.box_room import CAMERA, BoxRoom, circle, warming_up
 
 pytestmark = [pytest.mark.graph, pytest.mark.timeout(900)]
@@ -146,6 +148,30 @@ class SavedPoses:
             order = np.argsort(file["keyframe.stamps"])
             self.poses = file["keyframe.poses"][order]
             self.points = file["level0.points"]
+
+
+def test_an_image_set_gives_the_same_in_the_graph(environment: dict[str, str], tmp_path: Path) -> None:
+    views, outs = room(3), [tmp_path / name for name in ("inproc", "ros")]
+    bag = photos(tmp_path / "photos.mcap", views)
+    for out in outs:
+        done = sf(environment, "run", str(bag), "--goal", "mvd", "--engine", out.name, f"--out={out}")
+        assert done.returncode == 0, done.stderr
+    for name in ("trajectory.tum", "keyframes.tum", "camera.yaml", "surface.ply", "contact_sheet.png"):
+        assert len({(out / name).read_bytes() for out in outs}) == 1, name
+    for topic in ("/sf/depth/dense/image", "/sf/depth/dense/variance", "/sf/tracking/keyframe/depth"):
+        recorded = [payloads(out / "result.mcap", topic) for out in outs]
+        assert len(recorded[0]) == 3 and recorded[0] == recorded[1], topic
+    photos(tmp_path / "one.mcap", Views(views.camera, views.images[:1], [], []))
+    alone = sf(
+        environment, "run", str(tmp_path / "one.mcap"), "--goal", "mvd", "--engine", "ros", f"--out={tmp_path}/1"
+    )
+    assert alone.returncode == 2 and "at least 2 images" in alone.stderr
+
+
+def payloads(bag: Path, topic: str) -> list[bytes]:
+    """The images of a topic, pixel for pixel."""
+    with BagReader(bag) as reader:
+        return [bytes(reader.decode(raw).data) for raw in reader.messages([topic])]
 
 
 def test_rgbl_graph_records_everything_for_every_keyframe(

@@ -20,6 +20,7 @@ _ROUNDS = 4  # of reweighting
 _KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
 _GATE = 3.0  # px at a width of 640; a depth must explain at least one source within it
 _MIN_Z = 0.05
+_LEAST_EVIDENCE = 0.3  # weight of the sources that agree, times their number: one alone has to look alike
 # Measured against exact and sensor depth, alike on simulated and real images: a correspondence is this much less
 # sure along the epipolar line than its residual across it says, and a depth that few sources confirm less still.
 _COMMON = 2.5
@@ -114,7 +115,7 @@ def _result(
         misfit += kept * r2
         total += kept
         best = np.maximum(best, np.where(good, scale * part.a**2, np.float32(0)))
-    none = (support == 0) | (d <= 1e-5)
+    none = (total * support < _LEAST_EVIDENCE) | (d <= 1e-5)
     own = np.maximum((misfit + sigma**2) / (total + 0.5), sigma**2)  # px^2, drawn to that of the whole image
     own += (_UNCHECKED * unit / np.maximum(support, 1) ** 2) ** 2
     variance = _COMMON**2 * own / np.maximum(best, 1e-30)

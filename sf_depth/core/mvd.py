@@ -1,6 +1,6 @@
 """U2-MVD: depth of a reference image from others, unposed and uncalibrated if need be (paper Sec. V).
 
-    match -> cross check -> start -> [static, parallax, epipole check <-> dense BA] -> match again -> depth
+    match -> cross check -> start -> [static, parallax, epipole check <-> dense BA] -> sweep, match again -> depth
 
 :meth:`MultiViewDepth.recover` is the loop. Without given poses its unit of length is the median depth; see
 :mod:`sf_depth.core.scale` for the way to the global scale.
@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from sf_depth.config import DepthConfig
 from sf_depth.core import checks, dense_ba, dense_depth, pinhole
 from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
+from sf_depth.core.expectation import expected
 from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
 from sf_depth.core.outliers import lonely
 from sf_depth.core.parallel import each
@@ -120,7 +120,8 @@ class MultiViewDepth:
         at = _triangulated(matched.seen, theta, T) if theta is not None and T is not None else None
         fit = self._check_and_adjust(matched.seen, at or start(matched.seen, size, theta), size, not posed, free)
         for _ in range(self._config.rematches):
-            matched = self._match(reference, sources, _expected(fit, matched.grid, size))
+            guess = expected(reference, sources, fit.adjusted, fit.seen, matched.grid, _REGISTERED)
+            matched = self._match(reference, sources, guess)
             at = fit.adjusted.estimate
             at = _triangulated(matched.seen, at.theta, at.T)
             fit = self._check_and_adjust(matched.seen, at, size, not posed, free)
@@ -212,42 +213,6 @@ def _strided(target: Float32, weight: Float32, stride: int, size: Size) -> tuple
         weight[:, every[0], every[1]].reshape(count, -1).astype(np.float64),
     )
     return seen, uv.shape[:2]
-
-
-def _expected(fit: _Fit, grid: tuple[int, int], size: Size) -> list[Float32 | None]:
-    """Where the geometry known by now puts every reference pixel in each source; None for a lost source."""
-    at = fit.adjusted.estimate
-    confidence = (fit.seen.weight > 0).sum(axis=0) * at.inverse_depth**2
-    confidence /= fit.adjusted.inverse_depth_variance + 1e-6 * at.inverse_depth**2
-    d = _filled(at.inverse_depth.reshape(grid), np.minimum(confidence, 1e4).reshape(grid) / 1e4)
-    d = cv2.resize(d, (size.width, size.height), interpolation=cv2.INTER_LINEAR).reshape(-1)
-    x = pinhole.rays(at.theta, pixel_grid((size.height, size.width)).reshape(-1, 2).T.astype(np.float64))
-    known = registered(fit.seen)
-    out: list[Float32 | None] = []
-    for j, T in enumerate(at.T):
-        if not known[j]:
-            out.append(None)
-            continue
-        X = T[:3, :2] @ x + T[:3, 2:3] + T[:3, 3:] * d
-        uv = pinhole.project(at.theta, X[:2] / np.maximum(X[2], 0.05))
-        uv = np.clip(uv, -size.width, 2 * size.width)
-        out.append(uv.T.reshape(size.height, size.width, 2).astype(np.float32))
-    return out
-
-
-def _filled(values: Float64, confidence: Float64) -> Float32:
-    """An image without gaps: at every scale the finest level that knows something wins."""
-    levels = [((values * confidence).astype(np.float32), confidence.astype(np.float32))]
-    while min(levels[-1][0].shape) > 2:
-        levels.append((cv2.pyrDown(levels[-1][0]), cv2.pyrDown(levels[-1][1])))
-    top, bottom = levels.pop()
-    out = top / np.maximum(bottom, 1e-9)
-    while levels:
-        top, bottom = levels.pop()
-        coarse = cv2.resize(out, top.shape[::-1], interpolation=cv2.INTER_LINEAR)
-        share = np.minimum(bottom, 1.0)
-        out = np.where(bottom > 1e-6, top / np.maximum(bottom, 1e-9), 0.0) * share + (1.0 - share) * coarse
-    return np.asarray(np.maximum(out, 1e-3 * float(np.median(values))), dtype=np.float32)
 
 
 def _dense(matched: _Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:

@@ -7,13 +7,15 @@ most, fixes the intrinsics, the map frame and the unit; the others join at the s
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from sf_depth.config import DepthConfig
+from sf_depth.core import products
 from sf_depth.core.filling import Filler
 from sf_depth.core.matching import grey
 from sf_depth.core.mvd import MultiViewDepth, Recovered, check_images
@@ -48,6 +50,10 @@ class PhotoSet:
     recovered: Recovered
     reasons: dict[str, int] = field(default_factory=dict)
 
+    def save_products(self, folder: Path) -> None:
+        """Write poses, a coloured cloud and a contact sheet."""
+        products.save(folder, self.trajectory, self.observed, self.keyframes)
+
 
 class PhotoSetDepth:
     """Mode ``mvd``: a set of images without order, with or without intrinsics and poses."""
@@ -57,8 +63,11 @@ class PhotoSetDepth:
         self._mvd = MultiViewDepth(config)
         self._filler = Filler(config)
 
-    def estimate(self, frames: Sequence[Frame]) -> PhotoSet:
+    def estimate(self, frames: Sequence[Frame], heard: Callable[[int], None] = lambda done: None) -> PhotoSet:
         """Depth, pose and, where missing, intrinsics of all images that can be registered.
+
+        Args:
+            heard: told after every reference how many are done.
 
         Raises:
             FormatError: fewer than two images, or images that do not fit together.
@@ -74,7 +83,7 @@ class PhotoSetDepth:
         given = [frame.T_map_camera for frame in frames]
         posed = camera is not None and all(T is not None for T in given)
         work = _Work(self, frames, small, _overlaps(small), camera, full, given if posed else None)
-        work.run()
+        work.run(heard)
         return work.product()
 
     def recover(
@@ -150,7 +159,7 @@ class _Work:
         self._first: Recovered | None = None
         self._reasons: dict[str, int] = {}
 
-    def run(self) -> None:
+    def run(self, heard: Callable[[int], None]) -> None:
         """Every image that can be placed is a reference once, the best connected next.
 
         Raises:
@@ -173,6 +182,7 @@ class _Work:
             except InsufficientParallax as error:
                 failure = error
                 self._count(f"image {reference} has no depth: {error}")
+            heard(len(self._images) - len(waiting))
         for i in waiting:
             self._count(f"image {i} left out: it overlaps with no image that could be placed")
         if self._first is None:

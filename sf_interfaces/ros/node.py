@@ -147,9 +147,9 @@ class BlockNode(LifecycleNode):
         """Whether anybody listens to an output."""
         return self.output(topic).get_subscription_count() > 0
 
-    def sent_one(self, stamp_ns: int) -> None:
-        """Count one image or bundle sent and let the stream's state say so."""
-        self._sent += 1
+    def sent(self, stamp_ns: int, count: int = 1) -> None:
+        """Count images or bundles sent and let the stream's state say so (0: work goes on)."""
+        self._sent += count
         self._publish_state(_RUNNING, stamp_ns)
 
     def enqueue(self, kind: str, data: Any) -> None:

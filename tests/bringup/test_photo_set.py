@@ -15,13 +15,13 @@ sys.path.append(str(Path(__file__).parents[1] / "depth"))
 from views import Views, room
 
 from sf_bringup.calibration import CALIBRATE, calibrated
-from sf_bringup.photo_set import cloud
 from sf_bringup.pipeline import ProductionLine
 from sf_bringup.planner import plan
 from sf_bringup.preflight import inspect
 from sf_bringup.result_writer import ResultWriter
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.runner import RunRequest, run
+from sf_depth.core.products import cloud
 from sf_interfaces.blocks import Quantity, load_blocks
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import FormatError

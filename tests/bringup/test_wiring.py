@@ -11,7 +11,7 @@ from sf_bringup.wiring import NodeLaunch, launches
 from sf_interfaces import topics
 from sf_interfaces.blocks import Quantity, load_blocks
 from sf_interfaces.config import ConfigFile
-from sf_interfaces.errors import ConfigError, PlanError
+from sf_interfaces.errors import ConfigError
 
 Q = Quantity
 ROLES = {"rgb": "/cam/image_raw", "camera_info": "/cam/camera_info"}
@@ -62,9 +62,12 @@ def test_configuration_sections_become_parameters() -> None:
     assert tracking.parameters["patches"] == 99 and tracking.parameters["sync.depth_slop_s"] == 0.1
 
 
-def test_lines_that_cannot_run_are_refused() -> None:
-    with pytest.raises(PlanError, match="an image set is estimated at once"):
-        line({Q.IMAGE, Q.INTRINSICS}, {}, "mvd")
+@pytest.mark.parametrize("known", [set(), {Q.INTRINSICS}, {Q.INTRINSICS, Q.GIVEN_POSE}])
+def test_an_image_set_is_one_node_that_takes_what_is_known(known: set[Quantity]) -> None:
+    nodes = line({Q.IMAGE, *known}, {"pose": "/p"}, "mvd")
+    assert list(nodes) == ["depth"] and nodes["depth"].head and nodes["depth"].parameters["mode"] == "mvd"
+    assert nodes["depth"].parameters["sync.camera"] == (Q.INTRINSICS in known)
+    assert nodes["depth"].parameters["sync.pose"] == (Q.GIVEN_POSE in known)
 
 
 def test_single_frames_are_completed_without_a_pose() -> None:

@@ -48,7 +48,7 @@ class ReliefNode(BlockNode):
             image = relief_image(frame.depth, frame.camera, self._config)
             sent = messages.encode_image(messages.rclpy_factory, image, frame.stamp_ns, frame.camera.frame_id)
             self.output(topics.FLEXION_IMAGE).publish(sent)
-            self.sent_one(frame.stamp_ns)
+            self.sent(frame.stamp_ns)
 
 
 if __name__ == "__main__":

@@ -1,54 +1,30 @@
-"""Goal ``mvd``: an image set in, depth, poses, intrinsics, a coloured cloud and a contact sheet out."""
+"""The files of an image set: poses, a coloured cloud and a contact sheet."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from sf_bringup.planner import Plan
-from sf_bringup.preflight import BagInput
-from sf_bringup.result_writer import ResultWriter
-from sf_bringup.run_folder import RunFolder
 from sf_interfaces.geometry import se3
 from sf_interfaces.io.cloud import write_surface
 from sf_interfaces.io.trajectory import write_tum
-from sf_interfaces.types import DepthMap, Frame, Keyframe, PointCloud, UInt8
+from sf_interfaces.types import DepthMap, Keyframe, PointCloud, Trajectory, UInt8
 
-MVD = "depth:mvd"
 _TILE_WIDTH = 320  # px of the contact sheet
 _CLOUD_POINTS = 2_000_000  # of surface.ply at most
 _SURE = 0.05  # relative deviation beyond which a pixel is left out of the cloud, unless half of its image is no surer
 
 
-def is_photo_set(made: Plan) -> bool:
-    """Whether a plan is the one-shot estimation of an image set."""
-    return made.ids == (MVD,)
-
-
-def frames_without_camera(given: BagInput) -> list[Frame]:
-    """The images of a bag that has no intrinsics."""
-    from sf_bringup.calibration import bag_images
-
-    return [Frame(stamp, None, image) for stamp, image in bag_images(given)]
-
-
-def estimate(part: Any, frames: Sequence[Frame], folder: RunFolder, writer: ResultWriter) -> dict[str, int]:
-    """Run the part and leave its files; returns why images were left out."""
-    made = part.estimate(frames)
-    for keyframe in made.keyframes:
-        writer.keyframe(keyframe)
-        writer.dense(keyframe)
-    write_tum(folder.path / "trajectory.tum", made.trajectory)
-    write_tum(folder.path / "keyframes.tum", made.trajectory)
-    write_surface(folder.path / "surface.ply", cloud(made.keyframes))
-    contact_sheet(folder.path / "contact_sheet.png", made.observed, made.keyframes)
-    reasons: dict[str, int] = made.reasons
-    return reasons
+def save(folder: Path, trajectory: Trajectory, observed: Sequence[Keyframe], completed: Sequence[Keyframe]) -> None:
+    """``trajectory.tum``, ``keyframes.tum``, ``surface.ply`` and ``contact_sheet.png``."""
+    write_tum(folder / "trajectory.tum", trajectory)
+    write_tum(folder / "keyframes.tum", trajectory)
+    write_surface(folder / "surface.ply", cloud(completed))
+    contact_sheet(folder / "contact_sheet.png", observed, completed)
 
 
 def cloud(keyframes: Sequence[Keyframe]) -> PointCloud:
