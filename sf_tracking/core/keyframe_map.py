@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sf_interfaces.types import Camera, Float64, Keyframe, Scale
 from sf_interfaces.geometry import se3
+from sf_interfaces.types import Camera, Float64, Keyframe, Scale
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core import sim3
 from sf_tracking.core.places import Features, Index, Place, features, place_of_keyframe
