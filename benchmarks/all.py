@@ -21,7 +21,7 @@ _ROOMS = ["room0", "room1", "room2", "office0", "office1", "office2", "office3",
 FOLDER = {
     "speed": ([], ["--frames", "300", "--stride", "1", "--factor", "1"]),
     "rooms": ([], ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1"]),
-    "noise": ([], ["--rooms", *_ROOMS, "--frames", "120", "--factor", "0.5"]),
+    "noise": ([], ["--rooms", *_ROOMS, "--frames", "300"]),
     "rooms_given": (
         ["--frames", "60"],
         ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1", "--every", "10"],

@@ -1,6 +1,6 @@
 """Poses in rooms with structured-light depth and motion blur, beside other programs on the same frames.
 
-    python benchmarks/noise.py [--rooms room1 office4] [--frames 30] [--stride 2] [--factor 0.25] [--blur 0.01]
+    python benchmarks/noise.py [--rooms room1 office4] [--frames 25] [--stride 2] [--factor 0.4] [--blur 0.01]
 
 The noise of the depth is one of disparity, so at a smaller image it is larger in metres.
 """
@@ -41,9 +41,9 @@ def against_best(room: str, rows: Sequence[Mapping[str, Any]], frames: int) -> d
 def main() -> None:
     bench = Benchmark("noise", __doc__.splitlines()[0])
     bench.parser.add_argument("--rooms", nargs="+", default=["room1", "office4"], choices=paper.ROOMS)
-    bench.parser.add_argument("--frames", type=int, default=30)
+    bench.parser.add_argument("--frames", type=int, default=25)
     bench.parser.add_argument("--stride", type=int, default=2, help="take every n-th frame of 30 a second")
-    bench.parser.add_argument("--factor", type=float, default=0.25, help="of Replica's 1200x680 pixels")
+    bench.parser.add_argument("--factor", type=float, default=0.4, help="of Replica's 1200x680 pixels")
     bench.parser.add_argument("--blur", type=float, default=0.01, help="exposure, s")
     args = bench.parse()
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)

@@ -271,7 +271,8 @@ class KeyframeMap:
         self.stamps, self.S, self.places, self.edges = stamps, S, places, edges
         steps = np.linalg.norm(np.diff(S[:, :3, 3], axis=0), axis=1)
         self._walked = np.r_[0.0, np.cumsum(steps)].tolist() if len(stamps) else []
-        self._measured = [False] * len(stamps)
+        self._measured = [False] * len(stamps)  # not known any more; at worst a place gets another keyframe
+        self._came = (S[-1, :3, 3], self._walked[-1]) if len(stamps) else None
         for place in places:
             self._index.add(place.descriptors)
 

@@ -14,8 +14,9 @@ from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Frame, Trajectory
 from sf_tracking.config import TrackingConfig
+from sf_tracking.core.session import TrackingSession
 from sf_tracking.core.tracker import Tracker, TrackingState
-from tests.tracking.box_room import BoxRoom, path
+from tests.tracking.box_room import STEP_NS, BoxRoom, circle, path
 
 CONFIG = TrackingConfig(patches=150, window=6)
 
@@ -35,6 +36,34 @@ def test_a_still_camera_makes_no_keyframes_and_does_not_drift() -> None:
         update = tracker.track(replace(still, stamp_ns=still.stamp_ns + i * 33_000_000, image=image))
     assert np.abs(update.T_map_camera[:3, 3]).max() < 0.002  # m
     assert len(tracker.finish().keyframes) == 1
+
+
+@pytest.mark.parametrize("window", [3, 9])
+def test_a_walk_there_and_back_for_long_makes_the_keyframes_of_one(window: int) -> None:
+    """Every third frame lacks its depth; the window holds a part of the walk, or all of it."""
+    room, poses, count = BoxRoom(4), path(24, 0.06), 150
+    turns = np.abs((np.arange(count) + 23) % 46 - 23)
+    frames = [room.frame(k, T, "dense") for k, T in enumerate(poses)]
+    session, made, given = TrackingSession(replace(CONFIG, patches=100, window=window)), [], []
+    for i, k in enumerate(turns):
+        depth = None if i % 3 == 2 else frames[k].depth
+        given.append(replace(frames[k], stamp_ns=10**9 + i * STEP_NS, depth=depth))
+        made += [(i, keyframe) for keyframe in session.track(given[-1]).keyframes]
+    made += [(count, keyframe) for keyframe in session.finish().keyframes]
+    once = [keyframe for i, keyframe in made if i < 48]
+    assert len(made) <= max(len(once), 6) + 6
+    assert all(keyframe.depth is not None for _, keyframe in made)
+    found, truth = session.trajectory(), Trajectory(np.array([f.stamp_ns for f in given]), poses[turns])
+    assert len(found) == count and trajectory_error(found, truth).rmse < 0.003
+
+
+def test_a_full_turn_on_the_spot_comes_back_to_its_start() -> None:
+    room, poses = BoxRoom(8), circle(61, 60, 0.0)
+    frames = [room.frame(i, T, "dense") for i, T in enumerate(poses)]
+    tracker = Tracker(CONFIG)
+    updates = [tracker.track(f) for f in frames]
+    assert all(u.state is TrackingState.TRACKING for u in updates)
+    assert np.abs(updates[-1].T_map_camera[:3, 3]).max() < 0.01 and error_of(tracker, frames, poses) < 0.005
 
 
 def test_half_the_brightness_from_one_frame_to_the_next_is_no_loss() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Keyframe, PointCloud, Scale
+from sf_tracking.config import TrackingConfig
 from sf_tracking.core import sim3
 from sf_tracking.core.keyframe_map import KeyframeMap
 from sf_tracking.core.places import Index, features
@@ -114,6 +115,27 @@ def test_walls_that_all_look_alike_close_only_the_true_loop() -> None:
     found = KeyframeMap()
     closed = walk(found, keyframes(drifted(0.004), alike=True))
     assert not closed or (closed[0] > LAP - 3 and true_loops(found))
+
+
+def test_a_known_view_is_known_and_a_keyframe_that_is_dropped_leaves_no_trace() -> None:
+    found, given = KeyframeMap(), keyframes(turn(LAP + AGAIN))
+    walk(found, given[:LAP])
+    words, edges = found._index._holders.copy(), len(found.edges)
+    second = given[LAP]  # where the first one was
+    assert found.knows(second, TrackingConfig())
+    assert not found.knows(
+        replace(second, T_map_camera=turn(1)[0] @ se3.exp(np.r_[0.5, np.zeros(5)])), TrackingConfig()
+    )
+    found.add(second)
+    assert not found.told
+    found.drop()
+    assert len(found) == len(found.places) == LAP and len(found.edges) == edges
+    np.testing.assert_array_equal(found._index._holders, words)
+    found.add(given[LAP + 1])
+    i, j, Z, sigma, loop = found.edges[-1]
+    assert (i, j, loop) == (LAP - 1, LAP, False) and found._walked[-1] > found._walked[-2] + 0.2
+    np.testing.assert_allclose(Z, se3.inverse(turn(LAP)[-1]) @ turn(LAP + 2)[-1], atol=1e-9)
+    assert sigma[0] > 1.3 * found.edges[-2][3][0], "two steps err more than one"
 
 
 def test_loops_can_be_switched_off() -> None:
