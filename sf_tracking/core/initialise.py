@@ -26,6 +26,16 @@ _RIVAL = 0.95  # support of another motion relative to the best, from which the 
 _SAME = 0.2  # difference of two motions that count as one, rad and parts of the translation
 _ITERATIONS = 30  # of the first bundle adjustment, far from its solution
 _REMEMBERED = 300  # frames before the map that get a pose when it begins
+_VIEWS = 40  # of the latest of them whose image is kept until then
+
+
+@dataclass(slots=True)
+class _Seen:
+    """A frame between the reference and the map to be."""
+
+    stamp_ns: int
+    sights: Sights  # of the reference's patches
+    view: View | None  # of the latest frames
 
 
 @dataclass(slots=True)
@@ -35,7 +45,13 @@ class _Reference:
     keyframe: TrackedKeyframe
     uv: Float64  # [M, 2] px, where each patch was last seen
     alive: NDArray[np.bool_]  # [M]
-    tracks: list[tuple[int, Sights]] = field(default_factory=list)  # stamps of the frames since, and what they saw
+    frames: list[_Seen] = field(default_factory=list)  # since
+
+    def remember(self, seen: _Seen) -> None:
+        """Take a frame; of older ones the image is forgotten, the oldest ones are."""
+        self.frames = [*self.frames, seen][-_REMEMBERED:]
+        for old in self.frames[:-_VIEWS]:
+            old.view = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +101,7 @@ class Initialiser:
         pair = two_views(camera, uv, reference.uv, alive, self._config)
         begun = [] if pair is None else self._begin(reference, frame, view, pair)
         if not len(self._window):
-            reference.tracks = [*reference.tracks, (frame.stamp_ns, sights)][-_REMEMBERED:]
+            reference.remember(_Seen(frame.stamp_ns, sights, view))
         return begun
 
     def _follow(self, reference: _Reference, view: View) -> Sights | None:
@@ -123,20 +139,21 @@ class Initialiser:
         window.complete()
         window.rescale(float(np.median(first.patches.w)))
         self._reference = None
-        share = (np.arange(len(reference.tracks)) + 1.0) / (len(reference.tracks) + 1)
-        way = se3.log(second.T_cw)
-        return [
-            t for (stamp, sights), s in zip(reference.tracks, share) if (t := self._pose(first, stamp, sights, s * way))
-        ]
+        step = se3.log(second.T_cw) / (len(reference.frames) + 1)
+        poses = (self._pose(seen, se3.exp(i * step)) for i, seen in enumerate(reference.frames, start=1))
+        return [pose for pose in poses if pose is not None]
 
-    def _pose(
-        self, first: TrackedKeyframe, stamp: int, sights: Sights, way: Float64
-    ) -> tuple[int, Float64, Sights] | None:
-        """A frame before the map began, from where it saw the first keyframe's patches; ``way`` is about its motion."""
-        T_cw = se3.exp(way)
-        sights = replace(sights, J_w=reproject(first, T_cw).J_w[sights.patch])
-        solved = self._locate.again([first], sights, T_cw)
-        return None if solved is None else (stamp, solved, sights)
+    def _pose(self, seen: _Seen, T_cw: Float64) -> tuple[int, Float64, Sights] | None:
+        """A frame from before the map began, from where it saw the first keyframe's patches; ``T_cw`` is a guess."""
+        keyframes = self._window.keyframes
+        sights = replace(seen.sights, J_w=reproject(keyframes[0], T_cw).J_w[seen.sights.patch])
+        rough = self._locate.again(keyframes[:1], sights, T_cw)
+        found = (
+            None if seen.view is None else self._locate.align(keyframes, seen.view, T_cw if rough is None else rough)
+        )
+        if found is not None:
+            return seen.stamp_ns, found.T_cw, found.sights
+        return None if rough is None else (seen.stamp_ns, rough, sights)
 
 
 def _set_depth(keyframe: TrackedKeyframe, w: Float64) -> None:

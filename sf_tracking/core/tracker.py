@@ -164,7 +164,7 @@ class Tracker:
         first = self._window.keyframes[0]
         for stamp, T_cw, sights in poses:
             self._relative[stamp] = (first.frame.stamp_ns, first.T_cw @ se3.inverse(T_cw))
-            self._between.add(stamp, sights, [first])
+            self._between.add(stamp, sights, self._window.keyframes)
         self.state = TrackingState.TRACKING
         return self._tracked(frame.stamp_ns, (), None)
 
