@@ -3,7 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -13,21 +13,29 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame, Scale
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.bundle import project
-from sf_tracking.core.keyframes import TrackedKeyframe
-from sf_tracking.core.locate import Locator
-from sf_tracking.core.pose import solve_pose
-from sf_tracking.core.update import View, search
+from sf_tracking.core.keyframes import TrackedKeyframe, reproject
+from sf_tracking.core.locate import Locator, Sights
+from sf_tracking.core.update import UpdateOperator, View, search
 from sf_tracking.core.window import Window
 
-_RANSAC_PX = 1.0
-_GOOD_PX = 2.0  # reprojection error of a patch that two views explain
+_RANSAC_PX = 0.5
+_GOOD_PX = 1.0  # reprojection error of a patch that two views explain
 _TRACK_SHARE = 0.4  # of the reference's patches that must still be followed, or another reference is taken
 _SUPPORT = 0.75  # share of followed patches that two views must explain
 _RIVAL = 0.95  # support of another motion relative to the best, from which the choice is open
 _SAME = 0.2  # difference of two motions that count as one, rad and parts of the translation
-_SIGMA_PX = 0.5  # of followed patches
 _ITERATIONS = 30  # of the first bundle adjustment, far from its solution
 _REMEMBERED = 300  # frames before the map that get a pose when it begins
+_VIEWS = 40  # of the latest of them whose image is kept until then
+
+
+@dataclass(slots=True)
+class _Seen:
+    """A frame between the reference and the map to be."""
+
+    stamp_ns: int
+    sights: Sights  # of the reference's patches
+    view: View | None  # of the latest frames
 
 
 @dataclass(slots=True)
@@ -37,7 +45,13 @@ class _Reference:
     keyframe: TrackedKeyframe
     uv: Float64  # [M, 2] px, where each patch was last seen
     alive: NDArray[np.bool_]  # [M]
-    tracks: list[tuple[int, Float64, NDArray[np.bool_]]] = field(default_factory=list)  # (stamp, uv, alive) since
+    frames: list[_Seen] = field(default_factory=list)  # since
+
+    def remember(self, seen: _Seen) -> None:
+        """Take a frame; of older ones the image is forgotten, the oldest ones are."""
+        self.frames = [*self.frames, seen][-_REMEMBERED:]
+        for old in self.frames[:-_VIEWS]:
+            old.view = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,15 +66,20 @@ class TwoViews:
 class Initialiser:
     """Fills the empty window with the keyframes that begin the map."""
 
-    def __init__(self, config: TrackingConfig, window: Window, locate: Locator) -> None:
+    def __init__(self, config: TrackingConfig, operator: UpdateOperator, window: Window, locate: Locator) -> None:
         self._config = config
+        self._operator = operator
         self._window = window
         self._locate = locate
         self._reference: _Reference | None = None
         self.scale = Scale.METRIC
 
-    def __call__(self, frame: Frame, view: View) -> list[tuple[int, Float64]]:
-        """Take one frame; when the map begins, the window is filled and poses T_cw of earlier frames come back."""
+    def __call__(self, frame: Frame, view: View) -> list[tuple[int, Float64, Sights]]:
+        """Take one frame; when the map begins, the window is filled.
+
+        Returns:
+            Then, of the frames since the first keyframe, stamps, poses T_cw and what they saw of it.
+        """
         if frame.depth is not None or frame.sparse_depth is not None:
             keyframe = self._window.make(frame, view, np.eye(4))
             if keyframe is not None and int(keyframe.patches.measured.sum()) >= self._config.min_inliers:
@@ -70,7 +89,8 @@ class Initialiser:
                 return []
         self.scale = Scale.ARBITRARY
         reference = self._reference
-        if reference is None or not self._follow(reference, view):
+        sights = None if reference is None else self._follow(reference, view)
+        if reference is None or sights is None:
             fresh = self._window.make(frame, view, np.eye(4))
             self._reference = None
             if fresh is not None:
@@ -79,21 +99,30 @@ class Initialiser:
         camera = reference.keyframe.camera
         uv, alive = reference.keyframe.patches.uv, reference.alive
         pair = two_views(camera, uv, reference.uv, alive, self._config)
-        if pair is None:
-            track = (frame.stamp_ns, reference.uv.copy(), alive.copy())
-            reference.tracks = [*reference.tracks, track][-_REMEMBERED:]
-            return []
-        return self._begin(reference, frame, view, pair)
+        begun = [] if pair is None else self._begin(reference, frame, view, pair)
+        if not len(self._window):
+            reference.remember(_Seen(frame.stamp_ns, sights, view))
+        return begun
 
-    def _follow(self, reference: _Reference, view: View) -> bool:
-        """Follow the reference's patches into the next view; False when too few are left."""
+    def _follow(self, reference: _Reference, view: View) -> Sights | None:
+        """Follow the reference's patches into the next view: where they are; None when too few are left."""
         first = reference.keyframe
         uv, ok = search(self._config, first.view, first.patches.uv, view, reference.uv, wide=False)
         reference.alive = reference.alive & ok
         reference.uv = np.where(reference.alive[:, None], uv, reference.uv)
-        return float(reference.alive.mean()) > _TRACK_SHARE
+        take = np.flatnonzero(reference.alive)
+        if len(take) <= _TRACK_SHARE * len(first.patches):
+            return None
+        warp = np.broadcast_to(np.eye(2), (len(take), 2, 2))
+        update = self._operator(first.described.take(take), view, reference.uv[take], warp)
+        ok = update.valid & (np.linalg.norm(update.target - reference.uv[take], axis=1) < _RANSAC_PX)
+        take, target = take[ok], update.target[ok]
+        reference.uv[take] = target
+        return Sights(np.zeros(len(take), np.int64), take, target, update.information[ok], np.zeros((len(take), 2)))
 
-    def _begin(self, reference: _Reference, frame: Frame, view: View, pair: TwoViews) -> list[tuple[int, Float64]]:
+    def _begin(
+        self, reference: _Reference, frame: Frame, view: View, pair: TwoViews
+    ) -> list[tuple[int, Float64, Sights]]:
         """Two keyframes with refined motion and depth, scaled to a median depth of 1."""
         window, first = self._window, reference.keyframe
         unit = float(np.median(pair.w[pair.good]))
@@ -110,15 +139,21 @@ class Initialiser:
         window.complete()
         window.rescale(float(np.median(first.patches.w)))
         self._reference = None
-        return [(stamp, self._pose(first, uv, alive)) for stamp, uv, alive in reference.tracks]
+        step = se3.log(second.T_cw) / (len(reference.frames) + 1)
+        poses = (self._pose(seen, se3.exp(i * step)) for i, seen in enumerate(reference.frames, start=1))
+        return [pose for pose in poses if pose is not None]
 
-    @staticmethod
-    def _pose(first: TrackedKeyframe, uv: Float64, alive: NDArray[np.bool_]) -> Float64:
-        """Pose T_cw of a frame before the map began, from where it saw the first keyframe's patches."""
-        rays, w = first.patches.rays(first.camera)[alive], first.patches.w[alive]
-        X = np.concatenate([rays, np.ones((len(rays), 1))], axis=1)
-        information = np.broadcast_to(np.eye(2) / _SIGMA_PX**2, (len(rays), 2, 2))
-        return solve_pose(first.camera, np.eye(4), X, w, uv[alive], information, (30.0, 3.0)).T_cw
+    def _pose(self, seen: _Seen, T_cw: Float64) -> tuple[int, Float64, Sights] | None:
+        """A frame from before the map began, from where it saw the first keyframe's patches; ``T_cw`` is a guess."""
+        keyframes = self._window.keyframes
+        sights = replace(seen.sights, J_w=reproject(keyframes[0], T_cw).J_w[seen.sights.patch])
+        rough = self._locate.again(keyframes[:1], sights, T_cw)
+        found = (
+            None if seen.view is None else self._locate.align(keyframes, seen.view, T_cw if rough is None else rough)
+        )
+        if found is not None:
+            return seen.stamp_ns, found.T_cw, found.sights
+        return None if rough is None else (seen.stamp_ns, rough, sights)
 
 
 def _set_depth(keyframe: TrackedKeyframe, w: Float64) -> None:

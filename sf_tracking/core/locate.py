@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Float64
+from sf_interfaces.types import Camera, Float64
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.keyframes import Reprojection, TrackedKeyframe, reproject
+from sf_tracking.core.patches import Patches
 from sf_tracking.core.pose import Solution, solve_pose
 from sf_tracking.core.search import consensus
 from sf_tracking.core.update import UpdateOperator, View, search
@@ -27,6 +29,17 @@ _LIKELY = (0.5, 0.6)  # the same that make a search needless
 _MOTION = np.diag([0.03**-2] * 3 + [0.02**-2] * 3)  # information of a predicted pose, m and rad
 _HONEST, _PLENTY = 1.5, 80  # excess of errors and number of patches, from which patches alone are trusted
 _FAR = 1e-6  # inverse depth, 1/m, below which a point counts as that far
+
+
+class Placed(Protocol):
+    """Patches at a known place: a keyframe, or what remains of one."""
+
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def patches(self) -> Patches: ...
+    @property
+    def T_cw(self) -> Float64: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,9 +217,13 @@ class Locator:
             overlap,
         )
 
-    def _pose(
-        self, window: Sequence[TrackedKeyframe], sights: Sights, T_cw: Float64, scales: Sequence[float]
-    ) -> Solution:
+    def again(self, keyframes: Sequence[Placed], sights: Sights, T_cw: Float64) -> Float64 | None:
+        """Pose T_cw near a known one from sights of keyframes that have moved since; None where too few agree."""
+        solved = self._pose(keyframes, sights, T_cw, (3 * self._config.robust_sigmas, self._config.robust_sigmas))
+        enough = int((solved.error < self._config.inlier_px).sum()) >= self._config.min_inliers
+        return solved.T_cw if enough else None
+
+    def _pose(self, window: Sequence[Placed], sights: Sights, T_cw: Float64, scales: Sequence[float]) -> Solution:
         """Pose from sights whose information counts the uncertain depth of their patches."""
         X, w = _placed(window, sights)
         sigma = np.zeros(len(sights))
@@ -218,7 +235,7 @@ class Locator:
         return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, np.linalg.inv(covariance), scales)
 
 
-def _placed(window: Sequence[TrackedKeyframe], sights: Sights) -> tuple[Float64, Float64]:
+def _placed(window: Sequence[Placed], sights: Sights) -> tuple[Float64, Float64]:
     """Scaled points [E, 3] of sights, world position times inverse depth, and those inverse depths [E]."""
     X, w = np.zeros((len(sights), 3)), np.zeros(len(sights))
     for index, keyframe in enumerate(window):

@@ -99,15 +99,16 @@ def _candidates(frame: Frame, gray: UInt8, config: TrackingConfig) -> tuple[Floa
     return uv[good], score[good]
 
 
-def _fit_planes(offset: Float64, w: Float64, weight: Float64) -> tuple[Float64, Float64, Float64]:
+def fit_planes(offset: Float64, w: Float64, weight: Float64, flat: float = 0.0) -> tuple[Float64, Float64, Float64]:
     """Weighted fit ``w = w0 + slope . offset``: w0 [C], slope [C, 2] and the residual's deviation [C].
 
     Args:
         offset: [C, K, 2] px; w: [C, K] inverse depths; weight: [C, K], 0 where there is none.
+        flat: weight of the expectation that the slope is 0.
     """
     A = np.concatenate([np.ones((*w.shape, 1)), offset], axis=-1)
     At = (A * weight[..., None]).transpose(0, 2, 1)
-    plane = np.linalg.solve(At @ A + 1e-9 * np.eye(3), At @ w[..., None])[..., 0]
+    plane = np.linalg.solve(At @ A + 1e-9 * np.eye(3) + flat * np.diag([0.0, 1.0, 1.0]), At @ w[..., None])[..., 0]
     left = (w - (A @ plane[..., None])[..., 0]) ** 2 * weight
     return plane[:, 0], plane[:, 1:], np.sqrt(left.sum(axis=1) / np.maximum(weight.sum(axis=1) - 3, 1.0))
 
@@ -142,7 +143,7 @@ def measure(frame: Frame, uv: Float64, config: TrackingConfig) -> Measured:
     offset, w = _neighbourhood(frame, uv)
     known = np.isfinite(w)
     w = np.where(known, w, 0.0)
-    w0, slope, rough = _fit_planes(offset, w, known.astype(np.float64))
+    w0, slope, rough = fit_planes(offset, w, known.astype(np.float64))
     z = 1.0 / np.maximum(w0, 1e-3)
     # Structured light errs with z^2, that is alike in inverse depth; LiDAR alike in depth.
     dense = frame.sparse_depth is None

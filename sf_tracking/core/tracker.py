@@ -13,6 +13,7 @@ from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
+from sf_tracking.core.between import Between
 from sf_tracking.core.initialise import Initialiser
 from sf_tracking.core.keyframes import sees_the_same, wants_keyframe
 from sf_tracking.core.locate import Location, Locator, blind_location
@@ -23,6 +24,7 @@ from sf_tracking.core.window import Window
 
 _REGULAR = 1.5  # frame interval relative to the last, up to which frames count as regular
 _SAME_SURFACE = 0.6  # share of depth points that must lie on the keyframe's surface where nothing else tells the pose
+_SETTLED = 2  # frames between keyframes solved again with each frame
 _LONGEST = 3.0  # relative frame interval over which motion is extrapolated at most
 
 
@@ -83,7 +85,8 @@ class Tracker:
         self._operator: UpdateOperator = operator or make_operator(config)
         self._locate = Locator(config, self._operator)
         self._window = Window(config, self._operator)
-        self._initialiser = Initialiser(config, self._window, self._locate)
+        self._initialiser = Initialiser(config, self._operator, self._window, self._locate)
+        self._between = Between(config.window)
         self._final: dict[int, Float64] = {}  # stamp of keyframe -> T_map_camera
         self._relative: dict[int, tuple[int, Float64]] = {}  # stamp -> (stamp of its keyframe, T_keyframe_frame)
         self._recent: list[tuple[int, Float64]] = []  # the last two (stamp, T_cw), for the motion model
@@ -122,6 +125,7 @@ class Tracker:
         """End of the input: every keyframe still in the window becomes final."""
         stamp = self._window.keyframes[-1].frame.stamp_ns if len(self._window) else 0
         finished = tuple(self._retire() for _ in range(len(self._window)))
+        self._settle(None)
         return TrackingUpdate(stamp, None, self.state, finished, self.scale)
 
     def trajectory(self) -> Trajectory:
@@ -158,8 +162,9 @@ class Tracker:
         if not len(self._window):
             return TrackingUpdate(frame.stamp_ns, None, self.state, scale=self.scale)
         first = self._window.keyframes[0]
-        for stamp, T_cw in poses:
+        for stamp, T_cw, sights in poses:
             self._relative[stamp] = (first.frame.stamp_ns, first.T_cw @ se3.inverse(T_cw))
+            self._between.add(stamp, sights, self._window.keyframes)
         self.state = TrackingState.TRACKING
         return self._tracked(frame.stamp_ns, (), None)
 
@@ -230,17 +235,34 @@ class Tracker:
                 again = self._fit_shape(frame, again)
             keyframe = None if again is None else self._window.make(frame, view, again.T_cw)
         if again is not None and keyframe is not None:
-            self._window.add(keyframe, again)
+            self._window.add(keyframe, again, fixed=1 if self._unsettled else 2)
         else:
             anchor = self._window.settled
             self._relative[frame.stamp_ns] = (anchor.frame.stamp_ns, anchor.T_cw @ se3.inverse(found.T_cw))
+            self._between.add(frame.stamp_ns, found.sights, self._window.keyframes)
+        self._settle(_SETTLED)
         return finished
+
+    @property
+    def _unsettled(self) -> bool:
+        """The motion between the first two keyframes, which two views alone told, may still be refined."""
+        return self.scale is Scale.ARBITRARY and not self._final
 
     def _retire(self) -> Keyframe:
         """The oldest keyframe leaves the window: its pose is final."""
-        keyframe = self._window.retire().final(self.scale)
+        oldest = self._window.retire()
+        keyframe = oldest.final(self.scale)
+        self._between.settle(oldest)
         self._final[keyframe.stamp_ns] = keyframe.T_map_camera
         return keyframe
+
+    def _settle(self, most: int | None) -> None:
+        """Solve frames between keyframes again whose keyframes are final, at most so many."""
+        for stamp, sights, keyframes in self._between.due(most):
+            T_cw = self._locate.again(keyframes, sights, se3.inverse(self._pose_of(stamp)))
+            if T_cw is not None:
+                owner = self._relative[stamp][0]
+                self._relative[stamp] = (owner, se3.inverse(self._pose_of(owner)) @ se3.inverse(T_cw))
 
     def _pose_of(self, stamp_ns: int) -> Float64:
         if stamp_ns in self._final:

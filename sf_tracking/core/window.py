@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame
@@ -15,12 +14,11 @@ from sf_tracking.core.bundle import Problem, adjusting, information_root
 from sf_tracking.core.keyframes import TrackedKeyframe, reproject
 from sf_tracking.core.locate import Location, align_sights
 from sf_tracking.core.patches import Measured, Patches, extract
+from sf_tracking.core.relief import known_points, surface_at
 from sf_tracking.core.shape import fit
 from sf_tracking.core.update import UpdateOperator, View, search
 
 _GUESS = 0.5  # relative deviation of an inverse depth that is only expected from its neighbours
-_NEIGHBOURS = 5  # known patches whose median a new patch without depth starts from
-_KNOWN = 0.3  # relative deviation up to which a patch counts as known
 _AT_ONCE = 2  # keyframes in which a new one's patches are looked for per part of the work
 _CONTRADICTION = 10.0  # standard deviations between patches and surfaces, beyond which the surfaces do not count
 _DONE = object()
@@ -63,26 +61,21 @@ class Window:
         return TrackedKeyframe(frame, view, patches, self._operator.describe(view, uv), T_cw)
 
     def _patches(self, camera: Camera, T_cw: Float64, uv: Float64, found: Measured) -> Patches:
-        """Patches that start at their measured depth, or at what their neighbours let expect."""
+        """Patches that start at their measured depth, or at what those around them let expect."""
         measured = np.isfinite(found.w)
-        expected = self._expected(T_cw, uv) if not measured.all() else np.ones(len(uv))
-        w = np.where(measured, found.w, expected)
-        sigma = np.where(measured, found.sigma, _GUESS * expected)
-        return Patches(uv, found.slope, w, sigma, w.copy(), sigma.copy(), measured)
+        w, sigma, slope = found.w.copy(), found.sigma.copy(), found.slope.copy()
+        if not measured.all():
+            expected, tilt = surface_at(uv[~measured], *known_points(self.keyframes, T_cw))
+            w[~measured], sigma[~measured], slope[~measured] = expected, _GUESS * expected, tilt
+        return Patches(uv, slope, w, sigma, w.copy(), sigma.copy(), measured)
 
-    def _expected(self, T_cw: Float64, uv: Float64) -> Float64:
-        """Median inverse depth of the known patches nearest to each place; 1 where nothing is known."""
-        spots, depths = [], []
+    def _tilt(self) -> None:
+        """Slopes of patches without measured depth, from what is known around them by now."""
         for keyframe in self.keyframes:
-            at = reproject(keyframe, T_cw)
-            known = at.visible & (keyframe.patches.sigma < _KNOWN * keyframe.patches.w)
-            spots.append(at.uv[known])
-            depths.append(at.w[known])
-        place = np.concatenate(spots) if spots else np.zeros((0, 2))
-        if len(place) < _NEIGHBOURS:
-            return np.ones(len(uv))
-        near = cKDTree(place).query(uv, k=_NEIGHBOURS)[1]
-        return np.asarray(np.median(np.concatenate(depths)[near], axis=1))
+            free = ~keyframe.patches.measured
+            if free.any():
+                uv = keyframe.patches.uv[free]
+                keyframe.patches.slope[free] = surface_at(uv, *known_points(self.keyframes, keyframe.T_cw))[1]
 
     def add(self, keyframe: TrackedKeyframe, found: Location, fixed: int = 2, iterations: int | None = None) -> None:
         """Append a keyframe in which the window's patches were seen; the rest of its work is done in parts.
@@ -131,6 +124,7 @@ class Window:
             self._align_shapes(keyframe, others[-self._config.shape_keyframes :], found)
             yield
         yield from self._optimise(fixed, iterations)
+        self._tilt()
 
     def _align_shapes(self, keyframe: TrackedKeyframe, others: list[TrackedKeyframe], found: Location) -> None:
         """Relative motions of a keyframe from its measured surface and those of others.
