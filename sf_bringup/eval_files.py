@@ -47,7 +47,7 @@ def read_depth(path: Path) -> DepthMap:
         if path.suffix == ".npy":
             return DepthMap(_nan_for_zero(np.load(path)))
         image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError, KeyError) as error:
+    except Exception as error:  # numpy's header is a piece of Python, and its parser raises what that raises
         raise FormatError(f"cannot read depth {path} ({error}); give .npz with z, .npy or 16-bit PNG") from error
     if image is None or image.dtype != np.uint16 or image.ndim != 2:
         raise FormatError(f"{path} is no depth image; a PNG must have one channel of 16 bits, in millimetres")

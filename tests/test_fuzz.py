@@ -18,6 +18,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rosbags.rosbag1 import Writer as Writer1
+from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from sf_bringup.discovery import probe
@@ -25,12 +27,14 @@ from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.geometry.undistort import Distortion
 from sf_interfaces.io.bag import BagReader
+from sf_interfaces.io.datasets import ReadOptions, recognise, write
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.io.trajectory import read_tum, write_tum
 from sf_interfaces.ros import messages as m
 from sf_interfaces.types import Camera, DepthMap, Keyframe, PointCloud, Trajectory
 from sf_recon.config import ReconConfig
 from sf_recon.core.reconstruction import Reconstruction
+from tests.interfaces.layouts import LAYOUTS, Layout
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 RNG = np.random.default_rng(0)
@@ -164,6 +168,62 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.mark.parametrize("cut_end", [False, True])
 def test_damaged_bags(bag: bytes, tmp_path: Path, cut_end: bool) -> None:
     whole, path = bag[:-30] if cut_end else bag, tmp_path / "b.mcap"
+
+    def read() -> None:
+        with BagReader(path) as reader:
+            for raw in reader.messages():
+                only_sentences(lambda raw=raw: reader.decode(raw))  # type: ignore[misc]
+
+    @fuzz(40)
+    @given(damaged(whole))
+    def run(data: bytes) -> None:
+        path.write_bytes(data)
+        only_sentences(read)
+
+    run()
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.make.__name__)
+def test_damaged_data_sets(layout: Layout, tmp_path: Path) -> None:
+    """One file of the set after the other: lists, calibrations, poses, images, depth, sweeps, video."""
+    given_path = layout.make(tmp_path / "set", 2)
+    files = sorted(path for path in (tmp_path / "set").rglob("*") if path.is_file())
+    whole = {path: path.read_bytes() for path in files}
+
+    def read() -> None:
+        with SequenceWriter(tmp_path / "out.mcap") as writer:
+            write(recognise(given_path), writer, ReadOptions())
+
+    @fuzz(12)
+    @given(st.data())
+    def run(data: st.DataObject) -> None:
+        path = data.draw(st.sampled_from(files))
+        path.write_bytes(data.draw(damaged(whole[path])))
+        try:
+            only_sentences(read)
+        finally:
+            path.write_bytes(whole[path])
+
+    run()
+
+
+@pytest.mark.parametrize("kind", ["db3", "bag"])
+def test_damaged_bags_of_other_writers(kind: str, tmp_path: Path) -> None:
+    store = STORE if kind == "db3" else get_typestore(Stores.ROS1_NOETIC)
+    text = store.types["std_msgs/msg/String"](data="hello")
+    if kind == "db3":
+        with Writer(tmp_path / "whole", version=9) as writer:
+            topic = writer.add_connection("/text", text.__msgtype__, typestore=store)
+            for i in range(4):
+                writer.write(topic, i + 1, store.serialize_cdr(text, text.__msgtype__))
+        path = next((tmp_path / "whole").glob("*.db3"))
+    else:
+        path = tmp_path / "whole.bag"
+        with Writer1(path) as old:
+            topic = old.add_connection("/text", text.__msgtype__, typestore=store)
+            for i in range(4):
+                old.write(topic, i + 1, store.serialize_ros1(text, text.__msgtype__))
+    whole = path.read_bytes()
 
     def read() -> None:
         with BagReader(path) as reader:

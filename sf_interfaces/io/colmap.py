@@ -40,6 +40,8 @@ _LENS = {
     "RADIAL_FISHEYE": "equidistant",
 }
 _ONE_FOCAL = {"SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+# What damaged counts and lengths lead to: reading short, seeking out of range, asking for too much memory.
+_DAMAGED = (OSError, ValueError, IndexError, KeyError, OverflowError, MemoryError, struct.error)
 _POINTS_IN_A_PART = 100_000
 _T = TypeVar("_T")
 
@@ -121,7 +123,7 @@ def read_points(folder: Path) -> Iterator[PointCloud]:
                 if len(rows) == _POINTS_IN_A_PART:
                     yield _cloud(rows)
                     rows = []
-    except (ValueError, IndexError, struct.error) as error:
+    except _DAMAGED as error:
         raise FormatError(f"{file} is truncated or malformed ({error}); export the model again") from error
     if rows:
         yield _cloud(rows)
@@ -136,7 +138,7 @@ def _parsed(path: Path, parse: Callable[[BinaryIO], _T]) -> _T:
     try:
         with path.open("rb") as stream:
             return parse(stream)
-    except (OSError, ValueError, IndexError, KeyError, struct.error) as error:
+    except _DAMAGED as error:
         raise FormatError(f"{path} is missing, truncated or malformed ({error}); export the model again") from error
 
 

@@ -123,7 +123,7 @@ class Video(Dataset):
     @cached_property
     def _count(self) -> int:
         capture = self._open()
-        count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+        count = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))  # a damaged header may say anything
         capture.release()
         return count
 
