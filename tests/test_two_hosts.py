@@ -97,9 +97,8 @@ def test_a_line_on_two_hosts_survives_a_cut_link(hosts: tuple[list[str], list[st
         cut = time.time_ns()
         plug(ROBOT, "sf_a")
         station.until(lambda: newest(station) > cut, "keyframes taken after the cut")
-        print(
-            f"link cut for {CUT_S:g} s: a new keyframe is in the map {(time.time_ns() - cut) / 1e9:.1f} s after its return"
-        )
+        back = (time.time_ns() - cut) / 1e9
+        print(f"link cut for {CUT_S:g} s: a new keyframe is in the map {back:.1f} s after its return")
         assert station.process("sf_recon.node") == process and "restart" not in station.log + robot.log
         station.end()
         robot.end()
