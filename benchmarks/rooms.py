@@ -4,7 +4,8 @@
 
 The surface is scored where a view saw it, from samples to triangles, and between samples by NICE's protocol (culled
 by frusta) and NICER's (not culled). Our rooms have furniture with hidden insides, which a frustum does not leave out
-and Replica's scans do not have: the first is what compares with the paper's columns.
+and Replica's scans do not have: the first is what compares with the paper's columns. Depth alone (flexion) is tracked
+beside RGB-D.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -16,6 +17,7 @@ from typing import Any
 
 import paper
 from common import DEPTH, Benchmark, mean_row, print_rows, run_line, shrunk, simulated, without
+from lines import LINES, derive
 from paper import PAPER
 
 from sf_bringup import measures
@@ -70,6 +72,13 @@ def run_room(bag: Path, mesh: Path, out: Path) -> dict[str, Any]:
     return {**cells, "ms / frame": times["frame"].get("median_ms", ""), "seconds": run.info()["seconds"]}
 
 
+def depth_alone(bag: Path, out: Path) -> float:
+    """ATE in cm of the same walk tracked by its depth images alone."""
+    line = next(line for line in LINES if line.name == "depth-only SLAM")
+    run = run_line(derive(bag, line, bag.with_name(f"{bag.stem}-depth.mcap")), out, "tracking")
+    return 100 * measures.measure_trajectory(run).rmse
+
+
 def main() -> None:
     bench = Benchmark("rooms", __doc__.splitlines()[0])
     bench.parser.add_argument("--rooms", nargs="+", default=["room0", "office0"], choices=paper.ROOMS)
@@ -86,7 +95,8 @@ def main() -> None:
         Lpips.find()
     except SceneFactoryError as error:
         bench.note(f"No LPIPS: {error}.")
-    rows = []
+    rows: list[dict[str, Any]] = []
+    alone: list[dict[str, Any]] = []
     for room in args.rooms:
         spec = replace(shrunk(PRESETS[room], args.frames, args.stride, args.factor), depth="exact", novel_views=8)
         bag, mesh = simulated(spec, args.out)
@@ -96,6 +106,9 @@ def main() -> None:
             rows.append({"room": room, "input": kind, "system": "this run", **cells})
             rows.append(paper.room_row(room, kind))
             print_rows(rows[-2:])
+            if kind == "rgbd":
+                ate = depth_alone(bag, args.out / "rooms" / f"{room}-depth")
+                alone.append({"room": room, "RGB-D ATE cm": cells["ATE cm"], "depth alone ATE cm": ate})
     means = [
         mean_row([r for r in rows if (r["system"], r["input"]) == (system, kind)], system=system, input=kind)
         for kind in args.inputs
@@ -104,6 +117,8 @@ def main() -> None:
     columns = [row for kind in args.inputs for row in paper.columns(*(m for m in means if m["input"] == kind))]
     print_rows(columns)
     tables = {"this run | paper": columns, "per room": rows, "means": [*means, *paper.other_rows()]}
+    if alone:
+        tables["depth alone"] = [*alone, mean_row(alone, room="mean")]
     bench.write("Rooms like Replica's", tables)
 
 
