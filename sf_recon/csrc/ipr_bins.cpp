@@ -53,7 +53,7 @@ void Lots::copy_to(size_t tile, std::vector<Fragment>& out) const {
     }
 }
 
-void Binner::project(const float* points, size_t first, size_t last, const RasterSpec& s, Team& team) const {
+void Binner::project(const float* points, size_t first, size_t last, const RasterSpec& s, Worker& worker) const {
     Projected p;
     uint32_t rows[kBlock];
     for (size_t start = first; start < last; start += kBlock) {
@@ -68,11 +68,11 @@ void Binner::project(const float* points, size_t first, size_t last, const Raste
             const size_t i = rows[k];
             const Visible point{{p.u[i], p.v[i], p.z[i], static_cast<int32_t>(start + i)}, p.columns[i], p.rows[i]};
             if (p.wide[i]) {
-                team.wide.push_back(point);
+                worker.wide.push_back(point);
                 continue;
             }
             for (int ty = point.y0(); ty <= point.y1(); ++ty)
-                for (int tx = point.x0(); tx <= point.x1(); ++tx) team.lots.add(ty * tiles_x_ + tx, point.fragment);
+                for (int tx = point.x0(); tx <= point.x1(); ++tx) worker.lots.add(ty * tiles_x_ + tx, point.fragment);
         }
     }
 }
@@ -81,8 +81,8 @@ void Binner::project(const float* points, size_t first, size_t last, const Raste
 // so that memory does not grow with the area of the windows.
 void Binner::bound_tiles(const RasterSpec& s) {
     std::vector<std::vector<float>> nearest(bound_.size());  // heaps, the farthest on top
-    for (const Team& team : teams_)
-        for (const Visible& point : team.wide) {
+    for (const Worker& worker : workers_)
+        for (const Visible& point : worker.wide) {
             const Fragment& f = point.fragment;
             const float hx = half_width(s, s.fx, f.z), hy = half_width(s, s.fy, f.z);
             const int x0 = first_pixel(f.u, hx, 0), x1 = last_pixel(f.u, hx, s.width - 1);
@@ -104,35 +104,34 @@ void Binner::bound_tiles(const RasterSpec& s) {
         }
 }
 
-void Binner::add_wide(Team& team) const {
-    for (const Visible& point : team.wide)
+void Binner::add_wide(Worker& worker) const {
+    for (const Visible& point : worker.wide)
         for (int ty = point.y0(); ty <= point.y1(); ++ty)
             for (int tx = point.x0(); tx <= point.x1(); ++tx) {
                 const int tile = ty * tiles_x_ + tx;
-                if (point.fragment.z <= bound_[tile]) team.lots.add(tile, point.fragment);
+                if (point.fragment.z <= bound_[tile]) worker.lots.add(tile, point.fragment);
             }
 }
 
 void Binner::bin(const float* points, size_t n, const RasterSpec& s, int threads) {
     tiles_x_ = (s.width + kTile - 1) / kTile, tiles_y_ = (s.height + kTile - 1) / kTile;
     bound_.assign(tiles(), kInfinity);
-    teams_.resize(threads);
-#pragma omp parallel num_threads(threads)
-    {
-        Team& team = teams_[omp_get_thread_num()];
-        team.lots.clear(tiles());
-        team.wide.clear();
-#pragma omp for schedule(dynamic, 1)
-        for (size_t first = 0; first < n; first += kChunk) project(points, first, std::min(first + kChunk, n), s, team);
+    workers_.resize(threads);
+    for (Worker& worker : workers_) {  // also of threads that the system may not grant this time
+        worker.lots.clear(tiles());
+        worker.wide.clear();
     }
+#pragma omp parallel for schedule(dynamic, 1) num_threads(threads)
+    for (size_t first = 0; first < n; first += kChunk)
+        project(points, first, std::min(first + kChunk, n), s, workers_[omp_get_thread_num()]);
     bound_tiles(s);
 #pragma omp parallel for schedule(static, 1) num_threads(threads)
-    for (int i = 0; i < threads; ++i) add_wide(teams_[i]);
+    for (int i = 0; i < threads; ++i) add_wide(workers_[i]);
 }
 
 void Binner::fragments(int tile, std::vector<Fragment>& out) const {
     out.clear();
-    for (const Team& team : teams_) team.lots.copy_to(tile, out);
+    for (const Worker& worker : workers_) worker.lots.copy_to(tile, out);
 }
 
 }  // namespace sf

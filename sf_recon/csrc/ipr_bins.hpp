@@ -64,17 +64,17 @@ class Binner {
     void fragments(int tile, std::vector<Fragment>& out) const;
 
    private:
-    struct Team {  // of one thread
+    struct Worker {  // of one thread
         Lots lots;
         std::vector<Visible> wide;  // set aside: each may cover a whole tile
     };
 
-    void project(const float* points, size_t first, size_t last, const RasterSpec& s, Team& team) const;
+    void project(const float* points, size_t first, size_t last, const RasterSpec& s, Worker& worker) const;
     void bound_tiles(const RasterSpec& s);
-    void add_wide(Team& team) const;
+    void add_wide(Worker& worker) const;
 
     int tiles_x_ = 0, tiles_y_ = 0;
-    std::vector<Team> teams_;
+    std::vector<Worker> workers_;
     std::vector<float> bound_;  // [tiles] no wide point behind it can be drawn
 };
 

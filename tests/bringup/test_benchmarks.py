@@ -20,6 +20,7 @@ from sf_interfaces.types import Frame
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "benchmarks"))
 
 import common
+import map_memory
 import paper
 import peers
 
@@ -101,6 +102,18 @@ def test_the_paper_s_rows_average_to_the_printed_means() -> None:
     for kind, row in printed.items():
         for name, mean in row.items():
             assert np.mean(getattr(paper, name)[kind]) == pytest.approx(mean, rel=0.03), (kind, name)
+
+
+def test_our_means_stand_beside_the_paper_s_and_a_missing_one_is_said() -> None:
+    ours = {"input": "rgbd", "ATE cm": 0.3, "acc cm": 0.5, "comp cm": 1.0, "ratio %": 95.0, "PSNR": 30.0, "SSIM": 0.9}
+    rows = {row["column"]: row for row in paper.columns(ours, paper.room_row("room0", "rgbd"))}
+    assert rows["ATE cm"]["better"] == "paper" and rows["PSNR"]["better"] == "this run"
+    assert rows["LPIPS"]["this run"] == "not measured" and "better" not in rows["LPIPS"]
+    assert [rows["acc cm"][system] for system in ("this run", "paper")] == [0.5, 1.49]
+
+
+def test_keyframes_of_a_large_map_halve_the_gaps_between_earlier_ones() -> None:
+    assert map_memory.spread(800, 8) == [0, 400, 200, 600, 100, 500, 300, 700]
 
 
 def test_every_benchmark_has_a_command(shared_data: Callable[[str], Path], tmp_path: Path) -> None:

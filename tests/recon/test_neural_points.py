@@ -66,6 +66,20 @@ def test_parents_are_the_nearest_older_points() -> None:
     assert far.parents.tolist() == [-1] and near.parents.tolist() == [0]
 
 
+def test_all_levels_and_the_search_grid_weigh_little_for_each_finest_point() -> None:
+    rng = np.random.default_rng(0)
+    points = NeuralPoints(0.004, 3, 4.0)
+    xy = rng.uniform(-1, 1, (500_000, 2))
+    cloud = np.column_stack([xy, 0.3 * np.sin(4 * xy[:, 0])]).astype(np.float32)
+    points.allocate(cloud, np.full_like(cloud, 0.5))
+    grids = sum(level.grid.nbytes for level in points.levels)
+    assert 16 * len(points.levels[0]) < grids < 34 * len(points.levels[0])  # x y z id and free places
+    empty = native().PointGrid(0.1)
+    before = empty.nbytes
+    empty.add(np.zeros((1, 3), np.float32))
+    assert empty.nbytes > before
+
+
 def test_samples_that_are_not_finite_or_out_of_range() -> None:
     points = NeuralPoints(0.01, levels=2, multiplier=4.0)
     samples = np.array([[np.nan, 0, 0], [0, 0, 1]], np.float32)
