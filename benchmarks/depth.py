@@ -57,7 +57,7 @@ def measure(images: ImageSet, setting: str) -> dict[str, Any]:
     if images.truth is not None:
         cells |= _errors(found.depth, images.truth, setting, " seen")
         cells |= _errors(full, images.truth, setting)
-    cells |= cameras(found, images)
+    cells |= cameras(found, images) | ({"poses": "contradicted"} if found.contradicted else {})
     return cells | {"s depth": recovered - begun, "s complete": done - recovered}
 
 
@@ -138,7 +138,10 @@ def main() -> None:
     args = bench.parse()
     bench.note("One reference a set, all other views as sources; paper rows are on other data, with chosen sources.")
     bench.note("7-Scenes, frames 100-199: its depth is the reference, its poses are good to a degree or two only.")
-    groups: dict[str, Iterator[ImageSet]] = {"simulated": image_sets.simulated(args.all)}
+    groups: dict[str, Iterator[ImageSet]] = {
+        "simulated": image_sets.simulated(args.all),
+        "unseen": image_sets.unseen(args.all),
+    }
     if args.data is not None:
         groups["real"] = image_sets.real(args.data, args.all)
     rows: list[dict[str, Any]] = []

@@ -51,6 +51,7 @@ class DepthNode(BlockNode):
         super().__init__()
         self._config: DepthConfig | None = None
         self._one_shot: OneShot | None = None
+        self._images: ImageSet | None = None
         self.service(EstimateDepth, "estimate_depth", forwarded(self, "estimate"))
 
     def setup(self) -> None:
@@ -58,7 +59,7 @@ class DepthNode(BlockNode):
         self.leader = ""
         config = self.config()
         self._config, self._one_shot = config, None
-        self._images: ImageSet | None = None
+        self._images = None
         self._depth = self._part(config)
         if self._depth is None:
             if self.options.source == "sensors":

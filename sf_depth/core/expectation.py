@@ -31,6 +31,8 @@ def expected(
     height, width = reference.shape[:2]
     at, matched = fit.estimate, seen.weight > 0
     known = matched.sum(axis=1) >= least
+    if not known.any():
+        return [None] * len(known)
     placed = Estimate(at.theta, at.T[known], at.inverse_depth[matched.any(axis=0)])
     swept = sweep_planes(reference, [sources[j] for j in np.flatnonzero(known)], placed)
     d = _merged(at.inverse_depth.reshape(grid), _confidence(fit, seen).reshape(grid), swept)

@@ -29,8 +29,10 @@ from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Scale, UInt8
 _LEAST_CONTRAST = 2.0  # grey levels; below it an image is blank
 _CHECK_ROUNDS = 2  # the checks and dense BA improve each other
 _NOISY_POSES = 1.5  # given poses that leave so many times the residual of free ones are refined
+_LEAST_KEPT = 0.3  # share of the correspondences that given poses have to explain to be kept at all
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
 _BLOCK = 1 << 15  # pixels solved at once: their arrays stay in the cache
+CONTRADICTED = "given poses contradict the images: refined, they only give the scale, and the variance tells how well"
 _LEAST_DENSITY = 0.01  # share of the reference's pixels that has to be triangulated
 
 
@@ -46,6 +48,7 @@ class Recovered:
         focal_sigma: posterior deviation of the focal length relative to it; 0 where it was given.
         sigma: deviation of a correspondence, px.
         distortion: radial term k1 of the images, 0 unless it was estimated.
+        contradicted: given poses fit the images so badly that they were refined and only give the scale.
     """
 
     depth: DepthMap
@@ -55,6 +58,7 @@ class Recovered:
     focal_sigma: float
     sigma: float
     distortion: float
+    contradicted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,7 @@ class _Fit:
     adjusted: Adjusted
     seen: Observations
     scale_deviation: float = 0.0
+    contradicted: bool = False
 
 
 class MultiViewDepth:
@@ -110,25 +115,25 @@ class MultiViewDepth:
             InsufficientParallax: the views do not constrain depth.
         """
         check_images([reference, *sources])
-        T = T_source_reference
+        T = None if camera is None else T_source_reference
         size = Size(reference.shape[1], reference.shape[0])
         theta = None if camera is None else pinhole.theta_of(camera)
         free = self._config.intrinsics if camera is None else "none"
 
         matched = self._match(reference, sources, coarse=self._config.rematches > 0)
-        posed = theta is not None and T is not None
-        at = _triangulated(matched.seen, theta, T) if theta is not None and T is not None else None
-        fit = self._check_and_adjust(matched.seen, at or start(matched.seen, size, theta), size, not posed, free)
+        fit = None if theta is None or T is None else self._with_given_poses(matched.seen, theta, T, size)
+        kept = fit is not None  # whether the given poses are taken as they are
+        fit = fit or self._check_and_adjust(matched.seen, start(matched.seen, size, theta), size, True, free)
         for _ in range(self._config.rematches):
             guess = expected(reference, sources, fit.adjusted, fit.seen, matched.grid, _REGISTERED)
             matched = self._match(reference, sources, guess)
             at = fit.adjusted.estimate
             at = _triangulated(matched.seen, at.theta, at.T)
-            fit = self._check_and_adjust(matched.seen, at, size, not posed, free)
-        if posed:
-            fit = self._refine_noisy_poses(matched.seen, fit, size)
+            fit = self._check_and_adjust(matched.seen, at, size, not kept, free)
+        if theta is not None and T is not None:
+            fit = self._refine_noisy_poses(matched.seen, fit, size) if kept else _scaled(fit, T)
         depth = _dense(matched, fit, size)
-        return _recovered(depth, fit, size, camera, Scale.METRIC if posed else Scale.ARBITRARY)
+        return _recovered(depth, fit, size, camera, Scale.ARBITRARY if T is None else Scale.METRIC)
 
     def _match(
         self,
@@ -168,15 +173,33 @@ class MultiViewDepth:
             at = adjusted.estimate
         return _Fit(adjusted, good)
 
+    def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
+        """The fit with poses as given; None if they contradict most of the correspondences."""
+        try:
+            fit = self._check_and_adjust(seen, _triangulated(seen, theta, T), size, False, "none")
+        except InsufficientParallax:
+            return None
+        return fit if (fit.seen.weight > 0).sum() > _LEAST_KEPT * (seen.weight > 0).sum() else None
+
     def _refine_noisy_poses(self, seen: Observations, fit: _Fit, size: Size) -> _Fit:
-        """Given poses that fit the images badly are refined and only keep their scale."""
+        """Given poses that fit the images badly are refined and only keep their scale.
+
+        Those that fit a little worse than free ones are kept, and the part of the residual that they explain is as
+        unsure in the scale.
+        """
         given = fit.adjusted.estimate
         free = self._check_and_adjust(seen, given, size, True, "none")
+        scaled = _scaled(free, given.T)
         if fit.adjusted.sigma < _NOISY_POSES * free.adjusted.sigma:
-            return fit
-        at = free.adjusted.estimate
-        scale = from_translations(at.T[:, :3, 3], given.T[:, :3, 3])
-        return _Fit(dense_ba.rescaled(free.adjusted, scale.factor), free.seen, scale.deviation)
+            theirs = max(1.0 - (free.adjusted.sigma / fit.adjusted.sigma) ** 2, 0.0)
+            return _Fit(fit.adjusted, fit.seen, scaled.scale_deviation * theirs**0.5)
+        return scaled
+
+
+def _scaled(free: _Fit, T: Float64) -> _Fit:
+    """A fit with free poses, at the scale of given ones."""
+    scale = from_translations(free.adjusted.estimate.T[:, :3, 3], T[:, :3, 3])
+    return _Fit(dense_ba.rescaled(free.adjusted, scale.factor), free.seen, scale.deviation, contradicted=True)
 
 
 def check_images(images: Sequence[UInt8]) -> None:
@@ -261,5 +284,12 @@ def _recovered(
     own = camera or pinhole.camera_of(at.theta, size.width, size.height)
     focal_sigma = 0.0 if camera is not None else dense_depth.focal_deviation(adjusted)
     return Recovered(
-        DepthMap(z, variance, scale), own, at.T, registered(fit.seen), focal_sigma, adjusted.sigma, float(at.theta[4])
+        DepthMap(z, variance, scale),
+        own,
+        at.T,
+        registered(fit.seen),
+        focal_sigma,
+        adjusted.sigma,
+        float(at.theta[4]),
+        fit.contradicted,
     )

@@ -18,7 +18,7 @@ from sf_depth.config import DepthConfig
 from sf_depth.core import products
 from sf_depth.core.filling import Filler
 from sf_depth.core.matching import grey
-from sf_depth.core.mvd import MultiViewDepth, Recovered, check_images
+from sf_depth.core.mvd import CONTRADICTED, MultiViewDepth, Recovered, check_images
 from sf_depth.core.scale import GlobalScale, from_translations, in_unit
 from sf_depth.core.seeds import Features, detect, match_features
 from sf_interfaces.errors import FormatError, InsufficientParallax
@@ -199,6 +199,8 @@ class _Work:
         if self._given is not None:
             T = np.stack([se3.inverse(self._poses[j]) @ self._poses[reference] for j in sources])
         got = self._parts.recover(self._images, reference, sources, self._camera, T)
+        if got.contradicted:
+            self._count(CONTRADICTED)
         scale = GlobalScale(1.0, 0.0)
         if first:
             self._first, self._camera = got, got.camera

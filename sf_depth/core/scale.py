@@ -18,6 +18,7 @@ _TOLERANCE = 0.05  # relative difference of an inlier
 _LEAST_LANDMARKS = 8
 _MAD = 1.4826 * 1.2533  # from a median deviation to the deviation of a median, times the root of the count
 _CHI2_MEDIAN = 2.366  # of three degrees of freedom: a squared length per component
+_FEW = 1.6  # what few translations, as one, tell of their own spread: 1 + this / count is that of Student's quantile
 _LEAST_SHARE = 0.3  # of the landmarks that have to agree
 
 
@@ -78,7 +79,7 @@ def from_translations(estimated: Float64, given: Float64) -> GlobalScale:
     # What directions and lengths leave says how good the translations are. The errors of one source of poses are
     # alike, so their number does not make the scale surer.
     left = np.linalg.norm(scale * estimated[moving] - given[moving], axis=1) / true[moving]
-    deviation = float(np.sqrt(np.median(left**2) / _CHI2_MEDIAN))
+    deviation = float(np.sqrt(np.median(left**2) / _CHI2_MEDIAN)) * (1.0 + _FEW / len(ratios))
     return GlobalScale(scale, max(deviation, _TOLERANCE) if len(ratios) == 1 else deviation)
 
 

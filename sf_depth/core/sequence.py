@@ -15,7 +15,7 @@ import numpy as np
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.filling import Filler
-from sf_depth.core.mvd import MultiViewDepth
+from sf_depth.core.mvd import CONTRADICTED, MultiViewDepth, Recovered
 from sf_depth.core.neighbors import NeighborLimits, before_and_after
 from sf_depth.core.overlap import sighted_depth
 from sf_depth.core.scale import GlobalScale, from_landmarks, in_unit
@@ -38,8 +38,8 @@ class Setting(Protocol):
     def scene_depth(self, frame: Keyframe, others: list[Keyframe]) -> float | None:
         """Typical depth that a frame sees, in the unit of its pose; None while unknown."""
 
-    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> DepthMap:
-        """Depth at the global scale.
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[Recovered, GlobalScale]:
+        """Depth, and what brings it to the global scale.
 
         Raises:
             InsufficientParallax: the neighbours do not constrain it.
@@ -66,12 +66,11 @@ class SlamSetting:
         z = frame.landmarks.points[:, 2]
         return float(np.median(z[z > 0])) if (z > 0).any() else None
 
-    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> DepthMap:
-        """Unposed depth brought to the scale of the landmarks."""
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[Recovered, GlobalScale]:
+        """Unposed depth and the scale of the landmarks."""
         got = mvd.recover(frame.image, [s.image for s in sources], frame.camera)
         assert frame.landmarks is not None
-        scale = from_landmarks(got.depth.z, frame.landmarks.points.astype(np.float64), frame.camera)
-        return scaled(got.depth, scale, frame)
+        return got, from_landmarks(got.depth.z, frame.landmarks.points.astype(np.float64), frame.camera)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,10 +91,10 @@ class PosedSetting:
         """Median depth of sparse matches, triangulated with the given poses."""
         return sighted_depth(frame, others)
 
-    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> DepthMap:
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[Recovered, GlobalScale]:
         """Depth with the given poses; where they fit the images badly, their translations only give the scale."""
-        got = mvd.recover(frame.image, [s.image for s in sources], frame.camera, _relative(frame, sources))
-        return scaled(got.depth, GlobalScale(1.0, 0.0), frame)
+        T = _relative(frame, sources)
+        return mvd.recover(frame.image, [s.image for s in sources], frame.camera, T), GlobalScale(1.0, 0.0)
 
 
 class EachDepth:
@@ -177,14 +176,18 @@ class SequenceDepth:
         if len(chosen) < _LEAST_NEIGHBORS:
             return self._skip("too few good neighbours: the camera hardly moves, or turns too fast")
         try:
-            depth = self._setting.recover(self._mvd, frame, [self._frames[j] for j in chosen])
-            dense = self._filler.fill(replace(frame, depth=depth))
+            got, scale = self._setting.recover(self._mvd, frame, [self._frames[j] for j in chosen])
+            dense = self._filler.fill(replace(frame, depth=scaled(got.depth, scale, frame)))
         except SceneFactoryError as error:
             return self._skip(str(error))
+        if got.contradicted:
+            self._count(CONTRADICTED)
         self._last = frame
         return [dense]
 
     def _skip(self, reason: str) -> list[Keyframe]:
-        words = f"keyframe without depth: {reason}"
-        self.reasons[words] = self.reasons.get(words, 0) + 1
+        self._count(f"keyframe without depth: {reason}")
         return []
+
+    def _count(self, words: str) -> None:
+        self.reasons[words] = self.reasons.get(words, 0) + 1

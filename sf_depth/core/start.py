@@ -18,6 +18,7 @@ from sf_interfaces.errors import InsufficientParallax
 from sf_interfaces.types import Float64
 
 _SWEEP = np.geomspace(0.4, 3.2, 13)  # focal lengths tried, in image widths (102 to 18 degrees of view)
+_TRIAL = 5  # iterations that tell the focal lengths apart; the best three go on
 _SUBSET = 500  # correspondences of each source the start is made from
 _LEAST = 24  # correspondences a source needs
 _GATE = 1.5  # px at a width of 640; epipolar distance of an inlier
@@ -75,7 +76,7 @@ def _centred(size: Size, focal: float) -> Float64:
 
 
 def _refined(seen: Observations, at: Estimate, intrinsics: str) -> dense_ba.Adjusted:
-    return dense_ba.adjust(seen, at, intrinsics=intrinsics, iterations=8 if intrinsics == "none" else 15)
+    return dense_ba.adjust(seen, at, intrinsics=intrinsics, iterations=_TRIAL if intrinsics == "none" else 15)
 
 
 def _canonical(at: Estimate) -> Estimate:

@@ -55,3 +55,17 @@ def test_what_moves_gets_no_depth_or_an_unsure_one(motion: tuple[int, int]) -> N
     sure = np.sqrt(depth.variance)[inside & depth.valid] / scale < error / 3
     assert sure.sum() < 0.1 * inside.sum(), "garbage with a small variance"
     assert relative(np.where(inside, np.nan, depth.z), views.z[0]).mean() < 0.03
+
+
+def test_given_poses_that_contradict_the_images_only_give_the_scale() -> None:
+    views, rng = room(), np.random.default_rng(4)
+    T = views.T_source_reference
+    length = np.linalg.norm(T[:, :3, 3], axis=1).mean()
+    noise = rng.normal(size=(len(T), 6)) * np.repeat([0.1 * length, np.radians(2.0)], 3)
+    assert not MVD.recover(views.images[0], views.images[1:], views.camera, T).contradicted
+    found = MVD.recover(views.images[0], views.images[1:], views.camera, se3.exp(noise) @ T)
+    assert found.contradicted and relative(found.depth.z, views.z[0]).mean() < 0.03
+    scale = np.nanmedian(found.depth.z / views.z[0])
+    assert found.depth.variance is not None
+    sigma = np.nanmedian(np.sqrt(found.depth.variance) / found.depth.z)
+    assert 0.01 < sigma < 0.3 and abs(scale - 1) < 2 * sigma
