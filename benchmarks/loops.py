@@ -51,14 +51,18 @@ class Walk:
             seed=base.seed if seed is None else seed,
             **size,
         )
-        self._simulator = Simulator(self.spec)
+        self.simulator = Simulator(self.spec)
         lap_s = next(t for t in np.arange(5.0, 1e4, 0.05) if self._back(t))
         self.count = int((lap_s + AGAIN_S) * self.fps)
         self._rng = np.random.default_rng(0)
 
     def _back(self, t: float) -> bool:
-        T = se3.inverse(self._simulator.path.pose(0.0)) @ self._simulator.path.pose(t)
+        T = se3.inverse(self.simulator.path.pose(0.0)) @ self.simulator.path.pose(t)
         return bool(np.linalg.norm(T[:3, 3]) < 0.1 and np.trace(T[:3, :3]) > 2.99)
+
+    def poses(self) -> Float64:
+        """True T_map_camera of every frame."""
+        return self.simulator.path.pose(np.arange(self.count) / self.fps)
 
     def frame(self, index: int, twist: Float64 | None = None) -> tuple[Frame, Float64]:
         """Frame number ``index`` and its true pose.
@@ -66,10 +70,10 @@ class Walk:
         Args:
             twist: [6] of the camera as tracked so far, by which a sweep is de-skewed.
         """
-        image, z, T = self._simulator.frame(index)
+        image, z, T = self.simulator.frame(index)
         frame = Frame(round((index + 1) * 1e9 / self.fps), self.spec.camera, image)
         if self.kind == "rgbd":
-            return replace(frame, depth=DepthMap(self._simulator.sensor_depth(index, z))), T
+            return replace(frame, depth=DepthMap(self.simulator.sensor_depth(index, z))), T
         if self.kind == "rgbl":
             grid = self.spec.camera.pixel_grid()[::2, ::2].reshape(-1, 2)
             far = z[::2, ::2].ravel().astype(np.float64)
@@ -81,7 +85,7 @@ class Walk:
         return frame, T
 
     def _sweep(self, index: int, twist: Float64 | None) -> SparseDepth:
-        cloud, _ = self._simulator.sweep(index)
+        cloud, _ = self.simulator.sweep(index)
         assert cloud.time_offset_ns is not None
         points = cloud.points.astype(np.float64)
         if twist is not None:
