@@ -30,7 +30,7 @@ _CHANGES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what can be changed of a preset."""
     parser.add_argument(
-        "scene", help="a preset (demo, room, hall, palace, campus, room0-2, office0-4) or a .world file"
+        "scene", help="a preset (demo, room, hall, palace, garden, campus, room0-2, office0-4) or a .world file"
     )
     parser.add_argument("out", type=Path, help="the bag to write, .mcap")
     for name, kind in (

@@ -77,6 +77,7 @@ PATHS = {
     "hall": PathPlan((8.2, 2.1), 1.7, heading=2.2, speed=0.9),
     "palace": PathPlan((27.0, 17.0), 1.75, 0.08, 2.5, 0.14, 1.4, 1.3),
     "campus": PathPlan((115.0, 72.0), 55.0, 2.0, 2.6, -0.6, 8.0),
+    "garden": PathPlan((49.0, 34.0), 1.75, 0.08, 2.5, 0.14, 1.8, 1.9),
     "world": PathPlan((0.6, 0.4), 1.4),
 }
 
@@ -86,6 +87,7 @@ PRESETS: dict[str, SimulationSpec] = {
     "room": SimulationSpec("room"),
     "hall": SimulationSpec("hall", frames=1200, depth="structured_light"),
     "palace": SimulationSpec("palace", 1200, 10.0, lidar="spinning128", ground_truth_depth=False),
+    "garden": SimulationSpec("palace", 1700, 10.0, lidar="spinning64", ground_truth_depth=False, path=PATHS["garden"]),
     "campus": SimulationSpec("campus", 700, 10.0, lidar="spinning128", ground_truth_depth=False),
     **{
         name: SimulationSpec(name, 2000, 30.0, 1200, 680, 600.0, seed=k + 1, ground_truth_depth=False)

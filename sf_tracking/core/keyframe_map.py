@@ -99,16 +99,20 @@ class KeyframeMap:
         self._parts = self._search(keyframe, n)
 
     def knows(self, keyframe: Keyframe, config: TrackingConfig) -> bool:
-        """Whether one of the map's keyframes already sees what this one does: too little flow and enough overlap."""
+        """Whether an older keyframe already sees what this one does: too little flow and enough overlap.
+
+        Of those that shared the window with it the tracker has thought already.
+        """
         cloud, camera, T = keyframe.landmarks, keyframe.camera, keyframe.T_map_camera
-        if cloud is None or not len(cloud) or not len(self):
+        older = max(0, len(self) - config.window)
+        if cloud is None or not len(cloud) or not older:
             return False
         X = cloud.points.astype(np.float64)
         uv, flow = camera.project(X)[0], config.keyframe_flow * camera.width
-        moved = se3.inverse(sim3.rigid(self.S)) @ T  # [N, 4, 4]
+        moved = se3.inverse(sim3.rigid(self.S[:older])) @ T  # [N, 4, 4]
         turn, reach = 2 * flow / camera.fx, 2 * flow / camera.fx * float(np.median(X[:, 2]))
         near = (np.linalg.norm(moved[:, :3, 3], axis=1) < reach) & (moved[:, 2, 2] > np.cos(min(turn, np.pi)))
-        near &= np.array(self._measured) | (keyframe.depth is None)
+        near &= np.array(self._measured[:older]) | (keyframe.depth is None)
         for T_other_own in moved[near]:
             at, z = camera.project(se3.transform(T_other_own, X))
             with np.errstate(invalid="ignore"):

@@ -124,3 +124,37 @@ def test_every_benchmark_has_a_command(shared_data: Callable[[str], Path], tmp_p
     assert {"speed", "rooms", "depth", "scales", "real", "rasterize", "completion"} <= set(quick) == set(full)
     assert all(Path(command[1]).is_file() for command in quick.values())
     assert "--data" not in quick["rooms"] and "real" not in everything.commands(False, None, tmp_path)
+
+
+def test_a_peer_that_lost_the_camera_is_not_the_best() -> None:
+    import noise
+
+    rows = [
+        {"system": noise.OURS, "ATE cm": 0.2, "tracked": "30/30"},
+        {"system": "lost early", "ATE cm": 0.01, "tracked": "12/30"},
+        {"system": "good", "ATE cm": 0.4, "tracked": "29/30"},
+        {"system": "poor", "ATE cm": 4.0, "tracked": "30/30"},
+        {"system": "missing", "remark": "skipped"},
+    ]
+    found = noise.against_best("room0", rows, 30)
+    assert found["best peer"] == "good" and found["ratio"] == pytest.approx(0.5)
+    assert noise.against_best("room0", rows[:2], 30)["best peer"] == "none ran"
+
+
+def test_sweeps_of_a_walk_are_brought_to_the_image_by_the_motion_tracked_so_far() -> None:
+    import loops
+
+    walk = loops.Walk("garden-sweeps", 0.25)
+    assert np.linalg.norm(np.diff(walk.poses()[:, :3, 3], axis=0), axis=1).sum() > 251  # m
+
+    T, before = (walk.simulator.path.pose(k / walk.fps) for k in (20, 19))
+    twist = se3.twist_between(0, before, round(1e9 / walk.fps), T)
+
+    def off(factor: float) -> float:
+        """Mean distance, m, of the sweep's points from the surfaces."""
+        sparse = walk.frame(20, factor * twist)[0].sparse_depth
+        points = se3.transform(T, walk.spec.camera.unproject(sparse.uv, sparse.z))
+        return float(walk.simulator.renderer.clearance(points).mean())
+
+    right = off(1.0)
+    assert right < 0.01 and right < 0.95 * min(off(0.0), off(2.0))
