@@ -9,6 +9,7 @@ from enum import Enum
 
 import numpy as np
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Trajectory
@@ -45,8 +46,8 @@ class TrackingUpdate:
         keyframes: those whose pose became final with this frame, oldest first.
         scale: ARBITRARY where the map began without depth.
         edges: observations used for the pose; inliers: those that agree with it.
-        correction: corrected T_map_camera of all final keyframes, where a loop was closed; ``keyframes`` that are
-            not the last of this update still have the pose from before it.
+        correction: of all final keyframes, where a loop was closed; ``keyframes`` that are not the last of this
+            update still have pose and unit from before it.
         T_map_odom: what loops have corrected so far.
     """
 
@@ -57,10 +58,10 @@ class TrackingUpdate:
     scale: Scale = Scale.METRIC
     edges: int = 0
     inliers: int = 0
-    correction: Trajectory | None = None
+    correction: Correction | None = None
     T_map_odom: Float64 | None = None
 
-    def corrected_keyframes(self) -> Iterator[tuple[Keyframe, Trajectory | None]]:
+    def corrected_keyframes(self) -> Iterator[tuple[Keyframe, Correction | None]]:
         """The keyframes, and with the last one the correction: it holds from just before that one on."""
         for keyframe in self.keyframes:
             yield keyframe, self.correction if keyframe is self.keyframes[-1] else None
