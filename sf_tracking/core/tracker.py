@@ -215,7 +215,8 @@ class Tracker:
 
     def _remember(self, frame: Frame, view: View, found: Location) -> tuple[Keyframe, ...]:
         """Store the frame relative to a keyframe, or make it a keyframe and optimise the window."""
-        newest = self._window.keyframes[-1]
+        seen = [*self._window.keyframes]  # what the sights index
+        newest = seen[-1]
         own = found.sights.keyframe == len(self._window) - 1
         flow = np.linalg.norm(found.sights.uv[own] - newest.patches.uv[found.sights.patch[own]], axis=1)
         wanted = wants_keyframe(self._config, newest, flow, found.overlap)
@@ -232,7 +233,7 @@ class Tracker:
         else:
             anchor = self._window.settled
             self._relative[frame.stamp_ns] = (anchor.frame.stamp_ns, anchor.T_cw @ se3.inverse(found.T_cw))
-            self._between.add(frame.stamp_ns, found.sights, self._window.keyframes)
+            self._between.add(frame.stamp_ns, found.sights, seen)
         self._settle(_SETTLED)
         return finished
 
