@@ -1,6 +1,6 @@
 """Loops: the end point of walks that come back, with and without closing them; a lost camera; memory over a long walk.
 
-python benchmarks/loops.py [--walks room-rgbd room-mono palace-rgbl] [--factor 0.5] [--lost] [--memory 10000]
+python benchmarks/loops.py [--walks room-rgbd room-mono hall-mono palace-rgbl] [--factor 0.5] [--lost] [--memory 10000]
 
 The walks are rendered frame by frame; LiDAR depth is taken at every second pixel with 1.5 cm of noise, without sweeps.
 """
@@ -25,7 +25,7 @@ from sf_interfaces.types import DepthMap, Float64, Frame, Scale, SparseDepth
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.session import TrackingSession
 
-WALKS = {"room-rgbd": 10.0, "room-mono": 10.0, "palace-rgbl": 5.0}  # frames per s
+WALKS = {"room-rgbd": 10.0, "room-mono": 10.0, "hall-mono": 10.0, "palace-rgbl": 5.0}  # frames per s
 AGAIN_S = 6.0  # how long the walk goes on after the lap
 
 
