@@ -1,6 +1,6 @@
 """Loops: the end point of walks that come back, with and without closing them; a lost camera; memory over a long walk.
 
-python benchmarks/loops.py [--walks room-rgbd room-mono palace-rgbl garden-sweeps] [--seed 0] [--lost] [--memory 10000]
+python benchmarks/loops.py [--walks room-rgbd hall-mono palace-rgbl garden-sweeps ...] [--seed 0] [--lost] [--memory 10000]
 
 The walks are rendered frame by frame. ``rgbl``: depth at every second pixel with 1.5 cm of noise; ``sweeps``: those of
 a spinning LiDAR with 64 lines, de-skewed by the motion tracked so far as ``sf run`` does it.
@@ -29,7 +29,13 @@ from sf_interfaces.types import DepthMap, Float64, Frame, Scale, SparseDepth
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.session import TrackingSession
 
-WALKS = {"room-rgbd": 10.0, "room-mono": 10.0, "palace-rgbl": 5.0, "garden-sweeps": 10.0}  # frames per s
+WALKS = {  # frames per s
+    "room-rgbd": 10.0,
+    "room-mono": 10.0,
+    "hall-mono": 10.0,
+    "palace-rgbl": 5.0,
+    "garden-sweeps": 10.0,
+}
 AHEAD_DEG = 110.0  # what is made of a sweep: all that the camera can see
 AGAIN_S = 6.0  # how long the walk goes on after the lap
 

@@ -21,7 +21,7 @@ from sf_bringup.run_folder import RunFolder
 from sf_bringup.wiring import sync_values
 from sf_interfaces.blocks import BlockSpec, Quantity, load_blocks
 from sf_interfaces.config import ConfigFile, build
-from sf_interfaces.corrections import Corrections
+from sf_interfaces.corrections import Correction, Corrections
 from sf_interfaces.errors import ConfigError, FormatError, TrackingLost
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.sequence_writer import SequenceWriter
@@ -118,7 +118,7 @@ class ProductionLine:
         for keyframe, correction in update.corrected_keyframes():
             self.keyframe_poses[keyframe.stamp_ns] = keyframe.T_map_camera
             if correction is not None:
-                self.keyframe_poses |= dict(zip(correction.stamps_ns.tolist(), correction.poses, strict=True))
+                self.keyframe_poses |= dict(zip((k := correction.keyframes).stamps_ns.tolist(), k.poses, strict=True))
                 self._corrections.push(keyframe.stamp_ns, correction)
             self._writer.keyframe(keyframe, correction)
             self._complete(keyframe)
@@ -157,7 +157,7 @@ class ProductionLine:
                 added = self.reconstruction.add(keyframe)
             self._writer.surface(keyframe.stamp_ns, added)
 
-    def _correct(self, correction: Trajectory | None) -> None:
+    def _correct(self, correction: Correction | None) -> None:
         if correction is not None:
             with self.timings.measure("correction"):
                 self.reconstruction.correct(correction)

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Any
 
 from sf_interfaces import topics
+from sf_interfaces.corrections import Correction
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.types import Frame, Keyframe, PointCloud, Trajectory, UInt8
 
@@ -45,7 +46,7 @@ class ResultWriter:
         self._writer.pose(topics.TRACKING_POSE.name, stamp, T, "map")
         self._writer.tf(stamp, "map", frame.camera.frame_id, T)
 
-    def keyframe(self, keyframe: Keyframe, correction: Trajectory | None = None) -> None:
+    def keyframe(self, keyframe: Keyframe, correction: Correction | None = None) -> None:
         """The bundle of a final keyframe, with the poses it corrects."""
         stamp, frame_id = keyframe.stamp_ns, keyframe.camera.frame_id
         w = self._writer

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from sf_interfaces import topics
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.io.paths import inside
@@ -23,7 +24,7 @@ from sf_interfaces.ros.inbox import Inbox
 from sf_interfaces.ros.keyframes import KeyframeSource
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.process import run
-from sf_interfaces.types import Camera, Keyframe, PointCloud, Trajectory
+from sf_interfaces.types import Camera, Keyframe, PointCloud
 from sf_recon.config import ReconConfig
 from sf_recon.core.learner import FairLock, Learner
 from sf_recon.core.reconstruction import Reconstruction
@@ -143,7 +144,7 @@ class ReconNode(BlockNode):
             self._source.done(keyframe.stamp_ns)
             self._unsaved = 0
 
-    def _correct(self, correction: Trajectory | None) -> None:
+    def _correct(self, correction: Correction | None) -> None:
         """Let the map follow corrected keyframes; a live map is then published as a whole."""
         if correction is None:
             return

@@ -9,6 +9,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.geometry.undistort import Distortion
 from sf_interfaces.io.definitions import definition, typestore
 from sf_interfaces.io.mcap_writer import McapWriter
@@ -60,7 +61,7 @@ class SequenceWriter:
         """All poses of a trajectory as nav_msgs/Path."""
         self._write(topic, "nav_msgs/msg/Path", stamp_ns, messages.encode_path(self._make, trajectory, stamp_ns))
 
-    def keyframe_state(self, topic: str, stamp_ns: int, scale: Scale, correction: Trajectory | None) -> None:
+    def keyframe_state(self, topic: str, stamp_ns: int, scale: Scale, correction: Correction | None) -> None:
         """Scale of a keyframe and the poses it corrects."""
         definition(_STATE)  # makes the type known
         msg = messages.encode_keyframe_state(self._make, scale, stamp_ns, correction)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from sf_interfaces import topics
-from sf_interfaces.corrections import Corrections
+from sf_interfaces.corrections import Correction, Corrections
 from sf_interfaces.ros import messages
 from sf_interfaces.ros.inbox import KeyframeJoiner
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.topics import Topic
-from sf_interfaces.types import DepthMap, Keyframe, PointCloud, Trajectory
+from sf_interfaces.types import DepthMap, Keyframe, PointCloud
 
 TRACKED: dict[str, Topic] = {
     "image": topics.KEYFRAME_IMAGE,
@@ -38,7 +38,7 @@ def publish_bundle(
     keyframe: Keyframe,
     bundle: dict[str, Topic],
     parts: set[str],
-    correction: Trajectory | None = None,
+    correction: Correction | None = None,
 ) -> None:
     """Publish the named parts of a keyframe on the topics of a bundle.
 

@@ -7,12 +7,13 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.ros.bundles import COMPLETED, TRACKED, BundleInputs, publish_bundle
 from sf_interfaces.ros.node import BlockNode
 from sf_interfaces.ros.sensors import SensorInputs
-from sf_interfaces.types import Keyframe, Trajectory
+from sf_interfaces.types import Keyframe
 
 
 class KeyframeSource:
@@ -85,8 +86,8 @@ class KeyframeSource:
         """Everything up to this keyframe is dealt with and safe: a successor of this process need not repeat it."""
         self._done.write(stamp_ns)
 
-    def correction(self, stamp_ns: int | None = None) -> Trajectory | None:
-        """Corrected poses of keyframes, to be applied before the one with this stamp (None: at the end)."""
+    def correction(self, stamp_ns: int | None = None) -> Correction | None:
+        """The correction of keyframes to be applied before the one with this stamp (None: at the end)."""
         return None if self._sensors is not None else self._bundles.corrections.due(stamp_ns)
 
     @property

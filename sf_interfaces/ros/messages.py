@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.undistort import Distortion
@@ -220,21 +221,27 @@ def encode_path(make: Factory, trajectory: Trajectory, stamp_ns: int) -> Any:
     return make("nav_msgs/msg/Path")(header=header(make, stamp_ns, trajectory.frame), poses=poses)
 
 
-def decode_keyframe_state(msg: Any) -> tuple[Scale, Trajectory | None]:
-    """sf_interfaces/KeyframeState -> scale, and corrected T_map_camera by stamp where it brings any.
+def decode_keyframe_state(msg: Any) -> tuple[Scale, Correction | None]:
+    """sf_interfaces/KeyframeState -> scale, and the correction of keyframes where it brings one.
 
     Raises:
-        FormatError: an unknown scale, or a pose that is none.
+        FormatError: an unknown scale, a pose that is none, or not one scale for each pose.
     """
     if not 0 <= int(msg.scale) < len(_SCALES):
         raise FormatError(f"keyframe state has scale {msg.scale}; this program knows 0 (metric) and 1 (arbitrary)")
     scale, poses = _SCALES[int(msg.scale)], [decode_pose(pose) for pose in msg.corrected]
-    return scale, Trajectory.from_pairs([(stamp, T) for stamp, _, T in poses], scale) if poses else None
+    if not poses:
+        return scale, None
+    keyframes = Trajectory(np.array([t for t, _, _ in poses]), np.array([T for _, _, T in poses]), scale)
+    return scale, Correction(keyframes, np.array(msg.corrected_scale))
 
 
-def encode_keyframe_state(make: Factory, scale: Scale, stamp_ns: int, correction: Trajectory | None = None) -> Any:
-    """Scale of a keyframe, and the corrected poses of earlier ones it brings -> sf_interfaces/KeyframeState."""
-    corrected = [] if correction is None else encode_path(make, correction, stamp_ns).poses
+def encode_keyframe_state(make: Factory, scale: Scale, stamp_ns: int, correction: Correction | None = None) -> Any:
+    """Scale of a keyframe, and the correction of earlier ones it brings -> sf_interfaces/KeyframeState."""
+    corrected = [] if correction is None else encode_path(make, correction.keyframes, stamp_ns).poses
     return make("sf_interfaces/msg/KeyframeState")(
-        header=header(make, stamp_ns, "map"), scale=_SCALES.index(scale), corrected=corrected
+        header=header(make, stamp_ns, "map"),
+        scale=_SCALES.index(scale),
+        corrected=corrected,
+        corrected_scale=np.zeros(0) if correction is None else correction.scales,
     )

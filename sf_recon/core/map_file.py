@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,12 @@ class SavedMap:
         except (KeyError, ValueError) as error:
             raise FormatError(f"the map file lacks the poses of its keyframes: {error}") from error
 
+    @property
+    def units(self) -> dict[int, float]:
+        """Units of the map per unit in which a keyframe came, by stamp; empty where no loop was closed."""
+        stamps = self.arrays["keyframe.stamps"].tolist()
+        return dict(zip(stamps, self.arrays.get("keyframe.units", np.ones(len(stamps))).tolist(), strict=True))
+
 
 def write(
     path: Path,
@@ -54,6 +60,7 @@ def write(
     resolution: float,
     scale: Scale,
     poses: Mapping[int, Float64],
+    units: Sequence[float],
     points: NeuralPoints,
     trainer: Trainer,
 ) -> None:
@@ -62,6 +69,7 @@ def write(
     arrays = {f"network.{k}": v.numpy() for k, v in field.network.state_dict().items()}
     arrays["keyframe.stamps"] = np.array(list(poses), np.int64)
     arrays["keyframe.poses"] = np.array(list(poses.values())).reshape(-1, 4, 4)
+    arrays["keyframe.units"] = np.array(units, np.float64)
     for i, (level, features) in enumerate(zip(points.levels, field.features, strict=True)):
         arrays |= {f"level{i}.points": level.points, f"level{i}.sigmas": level.sigmas}
         arrays[f"level{i}.runs"] = np.array(level.runs, np.int64).reshape(-1, 2)

@@ -26,6 +26,7 @@ Int32 = NDArray[np.int32]
 
 CELL = 6.0  # width of a grid cell, in spacings: half the memory of 3, and no slower
 COPY_RADIUS = 4.0  # spacings within which a new point copies the feature of the nearest
+_MAX_SIGMA = 6e4  # m, what half precision holds
 SEARCH_RADIUS = 4.0  # spacings; a neighbour farther than this says nothing about a surface point
 
 
@@ -86,7 +87,7 @@ class Level:
         rows, parents = self.grid.add_spaced(positions, self.spacing, COPY_RADIUS * self.spacing)
         added = Added(positions[rows], np.ascontiguousarray(samples[rows, 3:6]), parents)
         self._points.append(added.points)
-        self._sigmas.append(samples[rows, 6].clip(0, 6e4).astype(np.float16))
+        self._sigmas.append(samples[rows, 6].clip(0, _MAX_SIGMA).astype(np.float16))
         if len(rows):
             self.runs.append((stamp_ns, len(rows)))
         return added
@@ -204,15 +205,16 @@ class NeuralPoints:
         self._tops.clear()
 
     def move(self, motions: Mapping[int, Float64]) -> None:
-        """Apply rigid motions [4, 4] (map frame) to the points that the keyframes with these stamps placed."""
+        """Apply similarities [4, 4] (map frame) to the points that the keyframes with these stamps placed."""
         for level in self.levels:
-            parts, start = [], 0
+            points, sigmas, start = level.points.copy(), level.sigmas.copy(), 0
             for stamp, count in level.runs:
-                part = level.points[start : start + count]
+                run = slice(start, start + count)
                 if stamp in motions:
-                    part = se3.transform(motions[stamp], part.astype(np.float64)).astype(np.float32)
-                parts.append(part)
+                    S = motions[stamp]
+                    points[run] = se3.transform(S, points[run].astype(np.float64))
+                    sigmas[run] = (sigmas[run] * np.cbrt(np.linalg.det(S[:3, :3]))).clip(0, _MAX_SIGMA)
                 start += count
-            if parts:
-                level.replace(np.concatenate(parts), level.sigmas, level.runs)
+            if start:
+                level.replace(points, sigmas, level.runs)
         self.changed()

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import ConfigError, FormatError
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, PointCloud, Scale, Trajectory
+from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, PointCloud, Scale
 from sf_recon.config import MESHES, ReconConfig
 from sf_recon.core import map_file, memory, products
 from sf_recon.core.color_field import ColorField
@@ -34,6 +35,7 @@ class Reconstruction:
         resolution: spacing of the finest points, m.
         scale: whether that is metric.
         poses: T_map_camera of every keyframe so far, by stamp in ns.
+        units: of the map per unit in which a keyframe came, by stamp, where corrections told one.
     """
 
     def __init__(self, config: ReconConfig) -> None:
@@ -44,6 +46,7 @@ class Reconstruction:
         self.resolution = config.resolution
         self.scale = Scale.METRIC
         self.poses: dict[int, Float64] = {}
+        self.units: dict[int, float] = {}
         self._points: NeuralPoints | None = None
         self._field: ColorField
         self._trainer: Trainer
@@ -118,23 +121,25 @@ class Reconstruction:
         if self._points is not None:
             self._trainer.run(self.config.final_iterations)
 
-    def correct(self, keyframes: Trajectory) -> None:
+    def correct(self, correction: Correction) -> None:
         """Move points and training views with the keyframes that placed them, as after a loop closure.
 
-        Args:
-            keyframes: corrected T_map_camera by keyframe stamp; stamps the map does not know are left out.
+        Where the unit of a keyframe has changed, what it placed grows about its camera: depths, deviations and all.
+        Keyframes the map does not know are left out.
         """
-        motion = {}
-        for stamp, T in zip(keyframes.stamps_ns.tolist(), keyframes.poses, strict=True):
-            if stamp in self.poses:
-                motion[stamp] = T @ se3.inverse(self.poses[stamp])
-                self.poses[stamp] = np.array(T)
-        if self._points is None or not motion:
+        if self._points is None:
             return
+        motions, growth, keyframes = {}, {}, correction.keyframes
+        for stamp, T, unit in zip(keyframes.stamps_ns.tolist(), keyframes.poses, correction.scales, strict=True):
+            if stamp in self.poses:
+                growth[stamp] = float(unit) / self.units.get(stamp, 1.0)
+                motions[stamp] = T @ np.diag([*[growth[stamp]] * 3, 1.0]) @ se3.inverse(self.poses[stamp])
+                self.poses[stamp], self.units[stamp] = np.array(T), float(unit)
         for view in self.views:
-            if view.stamp_ns in motion:
+            if view.stamp_ns in motions:
                 view.T_map_camera = self.poses[view.stamp_ns]
-        self._points.move(motion)
+                view.step *= growth[view.stamp_ns]
+        self._points.move(motions)
 
     def surface(self) -> PointCloud:
         """The finest points with the colour of the field, map frame; coarse ones where there are no finer."""
@@ -176,7 +181,8 @@ class Reconstruction:
         """Write the map (.sfmap): points, features, network, keyframe images and configuration."""
         if self._points is None:
             raise FormatError("the map is empty: add a keyframe before saving it")
-        map_file.write(path, self.config, self.resolution, self.scale, self.poses, self._points, self._trainer)
+        units = [self.units.get(stamp, 1.0) for stamp in self.poses]
+        map_file.write(path, self.config, self.resolution, self.scale, self.poses, units, self._points, self._trainer)
 
     def save_products(self, folder: Path) -> list[Path]:
         """Write ``map.sfmap``, ``surface.ply`` and, by configuration, ``mesh.ply``; the paths written."""
@@ -192,7 +198,7 @@ class Reconstruction:
         saved = map_file.read(path)
         out = Reconstruction(saved.config)
         out._start(saved.resolution)
-        out.scale, out.poses = saved.scale, saved.poses
+        out.scale, out.poses, out.units = saved.scale, saved.poses, saved.units
         map_file.restore(saved, out._points, out._trainer)  # type: ignore[arg-type]
         return out
 

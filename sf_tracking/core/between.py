@@ -45,9 +45,8 @@ class Between:
         self._due: deque[_Frame] = deque()
 
     def add(self, stamp_ns: int, sights: Sights, keyframes: Sequence[TrackedKeyframe]) -> None:
-        """Remember a frame that saw patches of ``keyframes``, unless all their depths are measured."""
-        newest = keyframes[-1]
-        if newest.patches.measured.all():
+        """Remember a frame that saw patches of ``keyframes``, unless depth was measured there."""
+        if keyframes[-1].patches.measured.any():
             return
         stamps = tuple(k.frame.stamp_ns for k in keyframes)
         self._waiting.setdefault(stamps[-1], deque(maxlen=_MOST)).append(_Frame(stamp_ns, sights, stamps))

@@ -8,7 +8,7 @@ frame, so that tracking never waits for it; a loop it finds takes effect with th
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -159,10 +159,23 @@ class KeyframeMap:
         """
         if not self._news:
             return None
+        self.complete()
         self._news, self._hints = False, []
         before = self.S
         self.S, _ = optimise(before, self._graph(), with_scale=self.scale is Scale.ARBITRARY)
-        return self.S @ sim3.inverse(before)
+        motion = self.S @ sim3.inverse(before)
+        self._renew(len(self) - 1)
+        return motion
+
+    def _renew(self, n: int) -> None:
+        """Keyframe ``n`` is published after the correction: in the unit that the map has there now."""
+        unit = float(sim3.scale_of(self.S[n]))
+        old = sim3.similarity(np.eye(4), 1.0 / unit)  # of the new unit in the old one
+        self.S[n] = sim3.rigid(self.S[n])
+        self.places[n] = replace(self.places[n], points=self.places[n].points * np.float32(unit))
+        for k, (i, j, Z, sigma, loop) in enumerate(self.edges):
+            if n in (i, j):
+                self.edges[k] = (i, j, sim3.inverse(old) @ Z if i == n else Z @ old, sigma, loop)
 
     def recognise(self, found: Features, camera: Camera, own: Place | None = None) -> Recognised | None:
         """Where in the whole map an image is, or None.

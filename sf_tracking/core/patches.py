@@ -18,6 +18,7 @@ _PLANE_NEIGHBOURS = 12  # points of sparse depth to which a plane is fitted
 _SPACING = 3.0  # px, side of the cells of which each gives one of them
 _KNOWN_SHARE = 0.5  # of the window that must carry depth
 _GRAZING = 0.04  # relative change of depth per px, above which a surface is seen too flat to be measured
+_FREE = 2  # times as many patches where their depth has to be found as well
 _SPARES = 1.6  # candidates per wanted patch, since some fail the test of their depth
 
 
@@ -172,9 +173,10 @@ def extract(frame: Frame, gray: UInt8, config: TrackingConfig) -> tuple[Float64,
     uv, score = _candidates(frame, gray, config)
     if len(uv) == 0:
         return uv.reshape(0, 2), measure(frame, uv.reshape(0, 2), config)
-    chosen = _spread(score, uv, camera, round(_SPARES * config.patches))
+    count = config.patches * (_FREE if frame.depth is None and frame.sparse_depth is None else 1)
+    chosen = _spread(score, uv, camera, round(_SPARES * count))
     uv = uv[chosen]
     found = measure(frame, uv, config)
     order = np.argsort(np.isnan(found.w), kind="stable")  # measured ones first, each in the order of choice
-    kept = np.sort(order[~found.broken[order]][: config.patches])
+    kept = np.sort(order[~found.broken[order]][:count])
     return uv[kept], found.take(kept)

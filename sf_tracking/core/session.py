@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, PointCloud, Scale, Trajectory
@@ -111,9 +112,11 @@ class TrackingSession:
             keyframes += self._revisited()
         elif not update.keyframes:
             self._map.work()
-        correction = self._correct() if keyframes else None
-        if correction is not None:
-            keyframes = (*keyframes[:-1], replace(keyframes[-1], T_map_camera=correction.poses[-1]))
+        correction = None
+        if keyframes and (motion := self._map.correct()) is not None:
+            correction = self._corrected(motion)
+            last = replace(_grown(keyframes[-1], motion[-1]), T_map_camera=correction.keyframes.poses[-1])
+            keyframes = (*keyframes[:-1], last)
         T = None if update.T_map_camera is None else sim3.rigid(self._start @ update.T_map_camera)
         return replace(
             update,
@@ -150,17 +153,10 @@ class TrackingSession:
 
     def _moved(self, keyframe: Keyframe) -> Keyframe:
         """A keyframe of the tracker in the map's frame and unit."""
-        S = self._start @ keyframe.T_map_camera
-        cloud, unit = keyframe.landmarks, float(sim3.scale_of(S))
-        if cloud is not None and unit != 1.0:
-            cloud = PointCloud(cloud.points * np.float32(unit), cloud.colors, None, cloud.stamp_ns, cloud.frame_id)
-        return replace(keyframe, T_map_camera=sim3.rigid(S), landmarks=cloud, scale=self._map.scale)
+        return replace(_grown(keyframe, self._start), scale=self._map.scale)
 
-    def _correct(self) -> Trajectory | None:
-        """Let loops take effect on everything that has a place; the corrected keyframes, None without any."""
-        motion = self._map.correct()
-        if motion is None:
-            return None
+    def _corrected(self, motion: Float64) -> Correction:
+        """Let the motions [N, 4, 4] of the keyframes take effect on everything that has a place."""
         stamps = np.array(self._map.stamps)
         own = len(self._anchors)
         self._anchors = list(motion[len(motion) - own :] @ np.array(self._anchors))
@@ -172,7 +168,8 @@ class TrackingSession:
                 zip(self._poses, sim3.rigid(motion[owner] @ np.array(list(self._poses.values()))), strict=True)
             )
         self._views = deque(((place, sim3.rigid(motion[-1] @ T)) for place, T in self._views), maxlen=_VIEWS)
-        return self.keyframe_trajectory()
+        metric = self._map.scale is Scale.METRIC
+        return Correction(self.keyframe_trajectory(), np.ones(len(stamps)) if metric else sim3.scale_of(self._map.S))
 
     # ---- a tracker whose place is still to be found
 
@@ -265,3 +262,11 @@ class TrackingSession:
         out._near = False
         out._begin(None if out._poses else np.eye(4))
         return out
+
+
+def _grown(keyframe: Keyframe, S: Float64) -> Keyframe:
+    """A keyframe moved by a similarity, with the landmarks in the new unit."""
+    T, cloud, unit = S @ keyframe.T_map_camera, keyframe.landmarks, float(sim3.scale_of(S))
+    if cloud is not None and unit != 1.0:
+        cloud = PointCloud(cloud.points * np.float32(unit), cloud.colors, None, cloud.stamp_ns, cloud.frame_id)
+    return replace(keyframe, T_map_camera=sim3.rigid(T), landmarks=cloud)

@@ -9,6 +9,7 @@ from enum import Enum
 
 import numpy as np
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Trajectory
@@ -45,8 +46,8 @@ class TrackingUpdate:
         keyframes: those whose pose became final with this frame, oldest first.
         scale: ARBITRARY where the map began without depth.
         edges: observations used for the pose; inliers: those that agree with it.
-        correction: corrected T_map_camera of all final keyframes, where a loop was closed; ``keyframes`` that are
-            not the last of this update still have the pose from before it.
+        correction: of all final keyframes, where a loop was closed; ``keyframes`` that are not the last of this
+            update still have pose and unit from before it.
         T_map_odom: what loops have corrected so far.
     """
 
@@ -57,10 +58,10 @@ class TrackingUpdate:
     scale: Scale = Scale.METRIC
     edges: int = 0
     inliers: int = 0
-    correction: Trajectory | None = None
+    correction: Correction | None = None
     T_map_odom: Float64 | None = None
 
-    def corrected_keyframes(self) -> Iterator[tuple[Keyframe, Trajectory | None]]:
+    def corrected_keyframes(self) -> Iterator[tuple[Keyframe, Correction | None]]:
         """The keyframes, and with the last one the correction: it holds from just before that one on."""
         for keyframe in self.keyframes:
             yield keyframe, self.correction if keyframe is self.keyframes[-1] else None
@@ -214,7 +215,8 @@ class Tracker:
 
     def _remember(self, frame: Frame, view: View, found: Location) -> tuple[Keyframe, ...]:
         """Store the frame relative to a keyframe, or make it a keyframe and optimise the window."""
-        newest = self._window.keyframes[-1]
+        seen = [*self._window.keyframes]  # what the sights index
+        newest = seen[-1]
         own = found.sights.keyframe == len(self._window) - 1
         flow = np.linalg.norm(found.sights.uv[own] - newest.patches.uv[found.sights.patch[own]], axis=1)
         measured = frame.depth is not None or frame.sparse_depth is not None
@@ -239,7 +241,7 @@ class Tracker:
         else:
             anchor = self._window.settled
             self._relative[frame.stamp_ns] = (anchor.frame.stamp_ns, anchor.T_cw @ se3.inverse(found.T_cw))
-            self._between.add(frame.stamp_ns, found.sights, self._window.keyframes)
+            self._between.add(frame.stamp_ns, found.sights, seen)
         self._settle(_SETTLED)
         return finished
 

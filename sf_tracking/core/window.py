@@ -70,12 +70,11 @@ class Window:
         return Patches(uv, slope, w, sigma, w.copy(), sigma.copy(), measured)
 
     def _tilt(self) -> None:
-        """Slopes of patches without measured depth, from what is known around them by now."""
+        """Slopes of patches in keyframes without measured depth, from what is known around them by now."""
         for keyframe in self.keyframes:
-            free = ~keyframe.patches.measured
-            if free.any():
-                uv = keyframe.patches.uv[free]
-                keyframe.patches.slope[free] = surface_at(uv, *known_points(self.keyframes, keyframe.T_cw))[1]
+            patches = keyframe.patches
+            if not patches.measured.any():
+                patches.slope = surface_at(patches.uv, *known_points(self.keyframes, keyframe.T_cw))[1]
 
     def add(self, keyframe: TrackedKeyframe, found: Location, fixed: int = 2, iterations: int | None = None) -> None:
         """Append a keyframe in which the window's patches were seen; the rest of its work is done in parts.

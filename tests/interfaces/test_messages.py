@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from rosbags.typesys import Stores, get_typestore
 
-from sf_interfaces.corrections import Corrections
+from sf_interfaces.corrections import Correction, Corrections
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.undistort import undistort_depth, undistort_image
@@ -361,22 +361,26 @@ def test_a_keyframe_says_its_scale_and_what_it_corrects(scale: Scale) -> None:
     name = "sf_interfaces/msg/KeyframeState"
     assert definition(name) is not None
     store = typestore()
-    correction = Trajectory(np.array([5, 10**9, STAMP]), se3.exp(np.random.default_rng(0).normal(0, 1, (3, 6))), scale)
+    poses = Trajectory(np.array([5, 10**9, STAMP]), se3.exp(np.random.default_rng(0).normal(0, 1, (3, 6))), scale)
+    correction = Correction(poses, np.array([1.0, 0.9, 1.1]))
     for sent in (None, correction):
         msg = m.encode_keyframe_state(lambda kind: store.types[kind], scale, STAMP, sent)
         got, back = m.decode_keyframe_state(store.deserialize_cdr(store.serialize_cdr(msg, name), name))
         assert got is scale and m.to_ns(msg.header.stamp) == STAMP
         assert (back is None) == (sent is None)
-    assert back is not None and back.scale is scale
-    np.testing.assert_array_equal(back.stamps_ns, correction.stamps_ns)
-    np.testing.assert_allclose(back.poses, correction.poses, atol=1e-12)
+    assert back is not None and back.keyframes.scale is scale
+    np.testing.assert_array_equal(back.keyframes.stamps_ns, poses.stamps_ns)
+    np.testing.assert_allclose(back.keyframes.poses, poses.poses, atol=1e-12)
+    np.testing.assert_array_equal(back.scales, correction.scales)
+    with pytest.raises(FormatError, match="one positive scale"):
+        m.decode_keyframe_state(dataclasses.replace(msg, corrected_scale=np.ones(2)))
     with pytest.raises(FormatError, match="scale 7"):
         m.decode_keyframe_state(dataclasses.replace(msg, scale=7))
 
 
 def test_corrections_wait_for_their_keyframe() -> None:
     waiting = Corrections()
-    first, second = (Trajectory(np.array([k]), np.eye(4)[None]) for k in (1, 2))
+    first, second = (Correction(Trajectory(np.array([k]), np.eye(4)[None]), np.ones(1)) for k in (1, 2))
     waiting.push(20, first)
     assert waiting.due(19) is None and waiting.due(20) is first and waiting.due(20) is None
     waiting.push(30, first)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Keyframe, Scale, Trajectory
@@ -127,7 +128,8 @@ def test_points_and_views_follow_their_keyframe() -> None:
         right.add(view(i))
         off = replace(view(i), T_map_camera=shift @ view(i).T_map_camera) if i > 5 else view(i)
         wrong.add(off)
-    wrong.correct(Trajectory.from_pairs([(i, view(i).T_map_camera) for i in (9, 10, 77)]))
+    keyframes = Trajectory.from_pairs([(i, view(i).T_map_camera) for i in (9, 10, 77)])
+    wrong.correct(Correction(keyframes, np.ones(3)))
     for i in (0, 9):
         a, b = (r.render(CAMERA, view(i).T_map_camera) for r in (right, wrong))
         both = a.depth.valid & b.depth.valid
@@ -135,6 +137,33 @@ def test_points_and_views_follow_their_keyframe() -> None:
         assert np.median(np.abs(a.depth.z - b.depth.z)[both]) < 0.1 * right.resolution
         assert psnr(a.image[both], b.image[both]) > 35
     wrong.add(view(11))  # it grows on
+
+
+def test_a_changed_unit_scales_what_a_keyframe_placed_about_its_camera(tmp_path: Path) -> None:
+    """Without a metric scale a loop finds how much the unit has shrunk: twice told, it is applied once."""
+    shift, shrunk = se3.exp(np.array([0.2, -0.1, 0.15, 0.02, 0.1, -0.05])), 0.8
+    right, wrong = (Reconstruction(replace(CONFIG, iterations=5)) for _ in range(2))
+    for i in (0, 9):
+        key = view(i)
+        assert key.depth is not None
+        right.add(key)
+        off = replace(key, T_map_camera=shift @ key.T_map_camera, depth=DepthMap(shrunk * key.depth.z)) if i else key
+        wrong.add(off)
+    correction = Correction(Trajectory.from_pairs([(9, view(9).T_map_camera)]), np.array([1 / shrunk]))
+    assert wrong.points is not None
+    level = wrong.points.levels[0]
+    mine, before = level.owners == 9, level.sigmas
+    wrong.correct(correction)
+    np.testing.assert_allclose(level.sigmas[mine], before[mine] / shrunk, rtol=2e-3)
+    np.testing.assert_array_equal(level.sigmas[~mine], before[~mine])
+    wrong.save(tmp_path / "map.sfmap")
+    wrong = Reconstruction.load(tmp_path / "map.sfmap")
+    wrong.correct(correction)
+    np.testing.assert_allclose(wrong.views[-1].depth, right.views[-1].depth, rtol=1e-3)
+    a, b = (r.render(CAMERA, view(9).T_map_camera) for r in (right, wrong))
+    both = a.depth.valid & b.depth.valid  # points placed in the smaller unit lie farther apart now
+    assert both.mean() > 0.9
+    assert np.median(np.abs(a.depth.z - b.depth.z)[both]) < 0.2 * right.resolution
 
 
 def test_memory_budget_forgets_the_far_and_old() -> None:
