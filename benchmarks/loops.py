@@ -1,6 +1,6 @@
 """Loops: the end point of walks that come back, with and without closing them; a lost camera; memory over a long walk.
 
-python benchmarks/loops.py [--walks room-rgbd hall-mono palace-rgbl garden-sweeps ...] [--seed 0] [--lost] [--memory 10000]
+python benchmarks/loops.py [--walks room-rgbd hall-mono palace-rgbl garden-sweeps ...] [--seed 0] [--lost] [--memory N]
 
 The walks are rendered frame by frame. ``rgbl``: depth at every second pixel with 1.5 cm of noise; ``sweeps``: those of
 a spinning LiDAR with 64 lines, de-skewed by the motion tracked so far as ``sf run`` does it.
