@@ -174,12 +174,15 @@ class MultiViewDepth:
         return _Fit(adjusted, good)
 
     def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
-        """The fit with poses as given; None if they contradict most of the correspondences."""
+        """The fit with poses as given; None if they contradict the correspondences, or explain few of them."""
         try:
             fit = self._check_and_adjust(seen, _triangulated(seen, theta, T), size, False, "none")
         except InsufficientParallax:
             return None
-        return fit if (fit.seen.weight > 0).sum() > _LEAST_KEPT * (seen.weight > 0).sum() else None
+        if (fit.seen.weight > 0).sum() < _LEAST_KEPT * (seen.weight > 0).sum():
+            return None
+        free = self._check_and_adjust(seen, fit.adjusted.estimate, size, True, "none")
+        return fit if fit.adjusted.sigma < _NOISY_POSES * free.adjusted.sigma else None
 
     def _refine_noisy_poses(self, seen: Observations, fit: _Fit, size: Size) -> _Fit:
         """Given poses that fit the images badly are refined and only keep their scale.
