@@ -104,7 +104,11 @@ def test_without_drift_a_loop_tells_nothing_and_changes_nothing() -> None:
 def test_a_unit_that_drifts_is_taken_back_too() -> None:
     S, found = drifted(0.0, 0.995), KeyframeMap()  # 20 % over the way
     found.scale = Scale.ARBITRARY
-    assert walk(found, keyframes(S, mono=True)) and true_loops(found)
+    closed = walk(found, keyframes(S, mono=True))
+    assert closed and true_loops(found)
+    units = sim3.scale_of(found.S)
+    assert units[LAP // 2] > 1.04, "half-way the unit had shrunk"
+    np.testing.assert_allclose(units[closed[0] - 1 :], 1.0, atol=0.05, err_msg="what came after has the map's unit")
     assert gap(S) > 0.07 and gap(found.S) < 0.03
     around = np.linalg.norm(np.diff(found.S[LAP - 2 : LAP + 4, :3, 3], axis=0), axis=1)
     true = np.linalg.norm(np.diff(turn(LAP + AGAIN)[LAP - 2 : LAP + 4, :3, 3], axis=0), axis=1)
