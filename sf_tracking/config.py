@@ -33,6 +33,7 @@ class TrackingConfig:
     inlier_px: float = option(2.0, "reprojection error of an agreeing edge, px", low=0.1)
     keyframe_flow: float = option(0.05, "mean flow that makes a keyframe, as part of the image width", low=0.001)
     keyframe_overlap: float = option(0.6, "share of patches still aligned below which a keyframe is made", high=1.0)
+    renew_s: float = option(60.0, "a place seen again makes a keyframe after so long, each time twice as late", low=0.0)
     parallax: float = option(0.005, "flow without rotation that starts a map without depth, per width", low=0.001)
     depth_gap: float = option(0.05, "relative depth step near a patch above which it is rejected", low=0.0)
     depth_sigma: float = option(0.004, "noise of dense inverse depth, 1/m (depth errs with z^2)", low=1e-6)

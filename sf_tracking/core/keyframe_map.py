@@ -101,25 +101,39 @@ class KeyframeMap:
     def knows(self, keyframe: Keyframe, config: TrackingConfig) -> bool:
         """Whether an older keyframe already sees what this one does: too little flow and enough overlap.
 
-        Of those that shared the window with it the tracker has thought already.
+        Of those that shared the window with it the tracker has thought already. What was seen ``renew_s`` ago, and
+        half as long ago as the first time, counts as forgotten: things move, and keyframes get lost on their way.
         """
-        cloud, camera, T = keyframe.landmarks, keyframe.camera, keyframe.T_map_camera
         older = max(0, len(self) - config.window)
-        if cloud is None or not len(cloud) or not older:
+        seen = [i for i in self._near(keyframe, config) if self._same_view(keyframe, i, config)]
+        if not seen or seen[0] >= older:
             return False
+        first, last = self.stamps[seen[0]], self.stamps[seen[-1]]
+        return keyframe.stamp_ns - last <= max(config.renew_s * 1e9, last - first)
+
+    def _near(self, keyframe: Keyframe, config: TrackingConfig) -> list[int]:
+        """Keyframes, with depth if this one has it, that may see the same, oldest first."""
+        cloud, camera = keyframe.landmarks, keyframe.camera
+        if cloud is None or not len(cloud) or not len(self):
+            return []
+        moved = se3.inverse(sim3.rigid(self.S)) @ keyframe.T_map_camera
+        turn = 2 * config.keyframe_flow * camera.width / camera.fx
+        near = np.linalg.norm(moved[:, :3, 3], axis=1) < turn * float(np.median(cloud.points[:, 2]))
+        near &= moved[:, 2, 2] > np.cos(min(turn, np.pi))
+        near &= np.array(self._measured) | (keyframe.depth is None)
+        return list(map(int, np.flatnonzero(near)))
+
+    def _same_view(self, keyframe: Keyframe, index: int, config: TrackingConfig) -> bool:
+        """Whether the landmarks of a keyframe lie in view of another one, and hardly elsewhere in its image."""
+        cloud, camera = keyframe.landmarks, keyframe.camera
+        assert cloud is not None
         X = cloud.points.astype(np.float64)
-        uv, flow = camera.project(X)[0], config.keyframe_flow * camera.width
-        moved = se3.inverse(sim3.rigid(self.S[:older])) @ T  # [N, 4, 4]
-        turn, reach = 2 * flow / camera.fx, 2 * flow / camera.fx * float(np.median(X[:, 2]))
-        near = (np.linalg.norm(moved[:, :3, 3], axis=1) < reach) & (moved[:, 2, 2] > np.cos(min(turn, np.pi)))
-        near &= np.array(self._measured[:older]) | (keyframe.depth is None)
-        for T_other_own in moved[near]:
-            at, z = camera.project(se3.transform(T_other_own, X))
-            with np.errstate(invalid="ignore"):
-                seen = (z > 0) & (at >= 0).all(axis=1) & (at < (camera.width, camera.height)).all(axis=1)
-            if seen.mean() >= config.keyframe_overlap and np.linalg.norm(at - uv, axis=1)[seen].mean() <= flow:
-                return True
-        return False
+        T = se3.inverse(sim3.rigid(self.S[index])) @ keyframe.T_map_camera
+        uv, z = camera.project(se3.transform(T, X))
+        with np.errstate(invalid="ignore"):
+            seen = (z > 0) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+        flow = np.linalg.norm(uv - camera.project(X)[0], axis=1)[seen]
+        return bool(seen.mean() >= config.keyframe_overlap and flow.mean() <= config.keyframe_flow * camera.width)
 
     @property
     def news(self) -> bool:

@@ -130,6 +130,8 @@ def test_a_known_view_is_known_and_a_keyframe_that_is_dropped_leaves_no_trace() 
     assert not found.knows(
         replace(second, T_map_camera=turn(1)[0] @ se3.exp(np.r_[0.5, np.zeros(5)])), TrackingConfig()
     )
+    stamps = [second.stamp_ns + round(s * 1e9) for s in (55, 65, 120, 135)]
+    assert [found.knows(replace(second, stamp_ns=t), TrackingConfig()) for t in stamps] == [True, False, False, False]
     found.add(second)
     assert not found.told
     found.drop()
@@ -155,3 +157,14 @@ def test_the_index_finds_what_shares_descriptors() -> None:
     scores = index.scores(noisy)
     assert np.argmax(scores) == 17 and scores[17] > 3 * np.sort(scores)[-2] and scores[50] == 0
     assert len(Index().scores(noisy)) == 0
+
+
+def test_a_place_that_is_seen_again_and_again_makes_keyframes_ever_more_seldom() -> None:
+    found, given, made = KeyframeMap(), keyframes(turn(LAP + AGAIN)), []
+    walk(found, given[:LAP])
+    for second in range(5, 2000, 5):
+        again = replace(given[LAP], stamp_ns=second * 10**9)
+        if not found.knows(again, TrackingConfig()):
+            found.add(again)
+            made.append(second)
+    assert made == [65, 135, 275, 555, 1115]
