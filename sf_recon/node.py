@@ -30,6 +30,7 @@ from sf_recon.core.learner import FairLock, Learner
 from sf_recon.core.reconstruction import Reconstruction
 
 _SNAPSHOT_KEYFRAMES = 15  # upstream keeps twice as many for a restarted node
+_SNAPSHOT_S = 30.0  # after so long also fewer are saved
 
 
 class ReconNode(BlockNode):
@@ -53,7 +54,7 @@ class ReconNode(BlockNode):
         self._reconstruction = Reconstruction(self.config()) if saved is None else Reconstruction.load(saved)
         self._source = KeyframeSource(self, landmarks=False)
         self._source.announces({"image", "camera_info", "pose", "state", "depth"})
-        self._unsaved, self._resumed = 0, saved is not None
+        self._unsaved, self._resumed, self._saved_s = 0, saved is not None, time.monotonic()
         self._camera: Camera | None = None
         self._last_ns = 0
         self._lock = FairLock()
@@ -82,6 +83,8 @@ class ReconNode(BlockNode):
                 self._draw_one(kind, msg)
             case "save":
                 msg.answer(self._save_service)
+            case "snapshot":
+                self._snapshot()
             case _:
                 for keyframe in self._source.push(kind, msg):
                     self.guarded(lambda keyframe=keyframe: self._add(keyframe))  # type: ignore[misc]
@@ -112,10 +115,14 @@ class ReconNode(BlockNode):
             self._save(self.out)
 
     def refresh(self) -> None:
-        """Why input was dropped."""
-        if self.leader:
-            self.health.set_drops(self._source.reasons)
-            self.health.waiting(self._source.waiting_for)
+        """Why input was dropped; where keyframes are rare, their snapshot is due by the clock."""
+        if not self.leader:
+            return
+        self.health.set_drops(self._source.reasons)
+        self.health.waiting(self._source.waiting_for)
+        if self._unsaved and not self.options.lossless and time.monotonic() - self._saved_s > _SNAPSHOT_S:
+            self._saved_s = time.monotonic()
+            self.enqueue("snapshot", None)
 
     def _add(self, keyframe: Keyframe) -> None:
         self._source.announce(keyframe)
@@ -138,11 +145,18 @@ class ReconNode(BlockNode):
         self._publish_surface(added)
         self.sent(keyframe.stamp_ns)
         self._unsaved += 1
-        if self._unsaved >= _SNAPSHOT_KEYFRAMES and (path := self.state("recon.sfmap")) is not None:
-            with self._lock, replace_file(path) as draft:
-                self._reconstruction.save(draft)
-            self._source.done(keyframe.stamp_ns)
-            self._unsaved = 0
+        if self._unsaved >= _SNAPSHOT_KEYFRAMES:
+            self._snapshot()
+
+    def _snapshot(self) -> None:
+        """Save what a successor goes on from."""
+        path = self.state("recon.sfmap")
+        if path is None or not self._unsaved:
+            return
+        with self._lock, replace_file(path) as draft:
+            self._reconstruction.save(draft)
+        self._source.done(self._last_ns)
+        self._unsaved, self._saved_s = 0, time.monotonic()
 
     def _correct(self, correction: Correction | None) -> None:
         """Let the map follow corrected keyframes; a live map is then published as a whole."""

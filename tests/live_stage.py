@@ -21,7 +21,8 @@ from sf_interfaces.ros.messages import decode_depth, decode_image, decode_pose
 from sf_interfaces.types import Trajectory
 
 DRIVER = Path(__file__).parent / "live_camera.py"
-FAST = ["--set", "recon.iterations=4", "--set", "recon.final_iterations=4"]
+# The walk is short and gone again and again: what was seen a second ago makes keyframes anew.
+FAST = ["--set", "recon.iterations=4", "--set", "recon.final_iterations=4", "--set", "tracking.renew_s=1"]
 PATIENCE_S = 150.0  # on a machine that does other things too
 
 
