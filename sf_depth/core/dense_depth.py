@@ -20,7 +20,7 @@ _ROUNDS = 4  # of reweighting
 _KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
 _GATE = 3.0  # px at a width of 640; a depth must explain at least one source within it
 _MIN_Z = 0.05
-_LEAST_EVIDENCE = 0.3  # weight of the sources that agree, times their number: one alone has to look alike
+_LEAST_EVIDENCE = 0.35  # weight of the sources that agree, times their number: one alone has to look alike
 # Measured against exact and sensor depth, alike on simulated and real images: a correspondence is this much less
 # sure along the epipolar line than its residual across it says, and a depth that few sources confirm less still.
 _COMMON = 2.5

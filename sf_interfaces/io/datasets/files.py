@@ -77,8 +77,8 @@ def read_image(path: Path, flags: int) -> NDArray[Any]:
     """
     try:
         data = path.read_bytes()
-    except OSError as error:
-        raise FormatError(f"image {path} is missing ({error.strerror}); copy the data set again") from error
+    except (OSError, ValueError) as error:  # a damaged list may name what is no path
+        raise FormatError(f"image {str(path)!r} is missing ({error}); copy the data set again") from error
     if not _is_whole(data):
         raise FormatError(f"image {path} is truncated ({len(data)} bytes); copy the data set again")
     if flags != cv2.IMREAD_UNCHANGED:
