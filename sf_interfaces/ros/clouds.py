@@ -16,11 +16,14 @@ _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: 
 _TIME_FIELDS = ("t", "time", "timestamp", "offset_time", "time_stamp")  # Ouster, Velodyne, Hesai, Livox, ...
 _LONGEST_SWEEP_NS = 10_000_000_000
 _NANOSECONDS_AS_FLOAT = 1e12  # a float time beyond this can only count nanoseconds
+_LONGEST_POINT = 1 << 20  # bytes; no driver has so many fields
 
 
 def _records(msg: Any) -> NDArray[np.void]:
     """The points [N] as records with the message's fields, as a view where rows carry no padding."""
     order = ">" if msg.is_bigendian else "<"
+    if int(msg.point_step) > _LONGEST_POINT:
+        raise FormatError(f"cloud has points of {msg.point_step} bytes; mend the driver that wrote it")
     names, formats, offsets = [], [], []
     for field in msg.fields:
         kind = _DATATYPES.get(int(field.datatype))
@@ -49,6 +52,14 @@ def _records(msg: Any) -> NDArray[np.void]:
         )
     grid: NDArray[np.void] = np.ndarray((height, width), layout, buffer=data.data, strides=(row_step, layout.itemsize))
     return grid.reshape(-1)
+
+
+def _scalars(records: NDArray[np.void], name: str) -> NDArray[Any]:
+    """A field [N] that has one value for each point."""
+    values = records[name]
+    if values.ndim != 1:
+        raise FormatError(f"cloud field '{name}' has {values.shape[1]} values a point, not one; mend its driver")
+    return values
 
 
 def _time_offsets(values: NDArray[Any], stamp_ns: int, name: str) -> NDArray[np.int64]:
@@ -101,15 +112,15 @@ def decode_cloud(msg: Any) -> PointCloud:
     """
     records = _records(msg)
     stamp_ns = to_ns(msg.header.stamp)
-    points = np.stack([records[axis].astype(np.float32) for axis in "xyz"], axis=-1)
+    points = np.stack([_scalars(records, axis).astype(np.float32) for axis in "xyz"], axis=-1)
     keep = np.isfinite(points).all(axis=1)
     names = records.dtype.names or ()
     color = next((name for name in ("rgb", "rgba") if name in names), None)
     time = next((name for name in _TIME_FIELDS if name in names), None)
     return PointCloud(
         points[keep],
-        None if color is None else _colors(records[color][keep]),
-        None if time is None else _time_offsets(records[time][keep], stamp_ns, time),
+        None if color is None else _colors(_scalars(records, color)[keep]),
+        None if time is None else _time_offsets(_scalars(records, time)[keep], stamp_ns, time),
         stamp_ns,
         msg.header.frame_id,
     )
