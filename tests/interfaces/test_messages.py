@@ -315,6 +315,11 @@ def test_malformed_clouds() -> None:
     ):
         with pytest.raises(FormatError, match=words):
             m.decode_cloud(dataclasses.replace(good, **change))
+    twice = [dataclasses.replace(field, count=2) if field.name == "x" else field for field in good.fields]
+    with pytest.raises(FormatError, match="2 values a point"):
+        m.decode_cloud(dataclasses.replace(good, fields=twice))
+    with pytest.raises(FormatError, match="points of 3000000000 bytes"):
+        m.decode_cloud(dataclasses.replace(good, point_step=3_000_000_000))
 
 
 @settings(max_examples=25, deadline=None)
