@@ -50,8 +50,10 @@ def read_tum(path: Path, scale: Scale = Scale.METRIC) -> Trajectory:
     rows = _rows(path, 8, "TUM")
     try:
         stamps = [int((Decimal(row[0]) * 10**9).to_integral_value()) for row in rows]
-    except InvalidOperation as error:
+    except (InvalidOperation, OverflowError, ValueError) as error:
         raise FormatError(f"{path} holds a stamp that is no number; mend that line") from error
+    if max(map(abs, stamps)) >= 1 << 63:
+        raise FormatError(f"{path} holds a stamp centuries away; TUM files count seconds, not nanoseconds")
     values = _numbers(path, [row[1:] for row in rows])
     if (np.linalg.norm(values[:, 3:], axis=1) < 1e-6).any():
         raise FormatError(f"{path} holds a quaternion of length zero; remove that line")
