@@ -21,6 +21,7 @@ from sf_tracking.core.pose_graph import Edges, optimise
 from sf_tracking.core.recognise import Sighting, sight
 
 _NEIGHBOURS = 15  # latest keyframes that are no loop
+_JUST_MADE = 2  # latest keyframes that a new one is allowed to resemble
 _CANDIDATES = 3  # places that are verified
 _APART = 5  # keyframes between two of them
 _ALIKE = 1.4  # score of a candidate relative to the median
@@ -101,10 +102,10 @@ class KeyframeMap:
     def knows(self, keyframe: Keyframe, config: TrackingConfig) -> bool:
         """Whether an older keyframe already sees what this one does: too little flow and enough overlap.
 
-        Of those that shared the window with it the tracker has thought already. What was seen ``renew_s`` ago, and
+        Of the last ones the tracker has thought already. What was seen ``renew_s`` ago, and
         half as long ago as the first time, counts as forgotten: things move, and keyframes get lost on their way.
         """
-        older = max(0, len(self) - config.window)
+        older = max(0, len(self) - _JUST_MADE)
         seen = [i for i in self._near(keyframe, config) if self._same_view(keyframe, i, config)]
         if not seen or seen[0] >= older:
             return False

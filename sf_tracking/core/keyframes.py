@@ -110,12 +110,3 @@ def wants_keyframe(
     keyframe.best_share = max(keyframe.best_share, share)
     wait = 1.0 if measured or not keyframe.patches.measured.any() else _WAITED
     return flow > wait or (flow > _MIN_FLOW and share < config.keyframe_overlap / wait * keyframe.best_share)
-
-
-def sees_the_same(config: TrackingConfig, keyframe: TrackedKeyframe, T_cw: Float64) -> bool:
-    """Whether a camera at T_cw sees so nearly what a keyframe does that it makes no other one."""
-    at = reproject(keyframe, T_cw)
-    if at.visible.mean() < config.keyframe_overlap:
-        return False
-    flow = np.linalg.norm(at.uv - keyframe.patches.uv, axis=1)[at.visible].mean()
-    return bool(flow <= config.keyframe_flow * keyframe.camera.width)

@@ -16,7 +16,7 @@ from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Traject
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.between import Between
 from sf_tracking.core.initialise import Initialiser
-from sf_tracking.core.keyframes import sees_the_same, wants_keyframe
+from sf_tracking.core.keyframes import wants_keyframe
 from sf_tracking.core.locate import Location, Locator, blind_location
 from sf_tracking.core.search import relocate
 from sf_tracking.core.shape import fit, shape_of
@@ -221,9 +221,6 @@ class Tracker:
         flow = np.linalg.norm(found.sights.uv[own] - newest.patches.uv[found.sights.patch[own]], axis=1)
         measured = frame.depth is not None or frame.sparse_depth is not None
         wanted = wants_keyframe(self._config, newest, flow, found.overlap, measured=measured)
-        # Where the camera comes back within the window, its patches there serve again.
-        older = self._window.keyframes[:-1]
-        wanted = wanted and not any(sees_the_same(self._config, keyframe, found.T_cw) for keyframe in older)
         done = self._window.work()
         if wanted and not done:
             self._window.complete()
