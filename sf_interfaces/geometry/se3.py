@@ -71,6 +71,19 @@ def log(T: Array) -> Array:
     return np.concatenate([rho, w], axis=-1)
 
 
+def log_near_identity(T: Array) -> Array:
+    """:func:`log` for angles below a radian, to 1e-5 of the translation there; several times as fast for a few motions."""
+    T = np.asarray(T, dtype=np.float64)
+    R, t = T[..., :3, :3], T[..., :3, 3]
+    v = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    sine = np.sqrt((v * v).sum(axis=-1, keepdims=True))
+    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1.0))
+    w = v * np.where(sine > _SMALL_ANGLE, angle / np.where(sine > _SMALL_ANGLE, sine, 1.0), 1.0)
+    turned = np.cross(w, t)
+    rho = t - 0.5 * turned + (1 / 12 + angle**2 / 720 + angle**4 / 30240) * np.cross(w, turned)
+    return np.concatenate([rho, w], axis=-1)
+
+
 def inverse(T: Array) -> Array:
     """Inverse of a rigid motion, by transposition. [..., 4, 4] -> [..., 4, 4]."""
     T = np.asarray(T, dtype=np.float64)

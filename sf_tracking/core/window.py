@@ -90,7 +90,7 @@ class Window:
             _remember(source, stamp, sights.patch[mine], sights.uv[mine], sights.information[mine])
         self.keyframes.append(keyframe)
         steps = iterations or self._config.bundle_iterations
-        parts = -(-(len(self.keyframes) - 1) // _AT_ONCE) + 1 + steps
+        parts = -(-(len(self.keyframes) - 1) // _AT_ONCE) + self._config.shape_keyframes + steps
         # As many frames as lay between the last two keyframes lie before the next, which has work enough of its own.
         self._pace, self._calls = -(-parts // max(1, self._calls - 1)), 0
         self._idle = False
@@ -119,25 +119,24 @@ class Window:
             self._observe(keyframe, target, found.excess)
             if count % _AT_ONCE == 0:
                 yield
-        if self._config.shape_trust and others:
-            self._align_shapes(keyframe, others[-self._config.shape_keyframes :], found)
+        for target in others[-self._config.shape_keyframes :] if self._config.shape_trust else ():
+            self._align_shapes(keyframe, target, found)
             yield
         yield from self._optimise(fixed, iterations)
         self._tilt()
 
-    def _align_shapes(self, keyframe: TrackedKeyframe, others: list[TrackedKeyframe], found: Location) -> None:
-        """Relative motions of a keyframe from its measured surface and those of others.
+    def _align_shapes(self, keyframe: TrackedKeyframe, target: TrackedKeyframe, found: Location) -> None:
+        """The relative motion of two keyframes from their measured surfaces.
 
         Surfaces that contradict patches which agree with each other are those of something that moves.
         """
-        for target in others:
-            source_shape, target_shape = (k.measured_shape(self._config) for k in (keyframe, target))
-            if source_shape is not None and target_shape is not None:
-                T = target.T_cw @ se3.inverse(keyframe.T_cw)
-                trust = self._config.shape_trust
-                moved = fit(keyframe.camera, source_shape, target_shape, T, np.eye(6), trust)
-                if moved is not None and (found.doubtful or found.distance(T, moved.T) < _CONTRADICTION):
-                    keyframe.moved[target.frame.stamp_ns] = moved
+        source_shape, target_shape = (k.measured_shape(self._config) for k in (keyframe, target))
+        if source_shape is None or target_shape is None:
+            return
+        T = target.T_cw @ se3.inverse(keyframe.T_cw)
+        moved = fit(keyframe.camera, source_shape, target_shape, T, np.eye(6), self._config.shape_trust)
+        if moved is not None and (found.doubtful or found.distance(T, moved.T) < _CONTRADICTION):
+            keyframe.moved[target.frame.stamp_ns] = moved
 
     def _observe(self, source: TrackedKeyframe, target: TrackedKeyframe, excess: float) -> None:
         """Look for the patches of ``source`` in ``target``; over levels where their depth is only guessed."""

@@ -48,6 +48,14 @@ def test_log_inverts_exp(xi: np.ndarray) -> None:
 
 
 @given(motions)
+def test_the_fast_logarithm_equals_the_other_near_identity(T: np.ndarray) -> None:
+    xi = se3.log(T)
+    xi[3:] *= min(1.0, 0.5 / max(np.linalg.norm(xi[3:]), 1e-9))
+    near = se3.exp(np.stack([xi, 1e-9 * xi, 0 * xi]))
+    np.testing.assert_allclose(se3.log_near_identity(near), [xi, 1e-9 * xi, 0 * xi], atol=1e-7 * (1 + np.abs(xi).max()))
+
+
+@given(motions)
 def test_exp_inverts_log_and_stays_rigid(T: np.ndarray) -> None:
     np.testing.assert_allclose(se3.exp(se3.log(T)), T, atol=1e-6)
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
