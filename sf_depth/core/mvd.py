@@ -20,7 +20,7 @@ from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
 from sf_depth.core.expectation import expected
 from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
 from sf_depth.core.outliers import lonely
-from sf_depth.core.parallel import each
+from sf_depth.core.parallel import each, one_blas_thread
 from sf_depth.core.scale import from_translations
 from sf_depth.core.start import Size, start, triangulate
 from sf_interfaces.errors import FormatError, InsufficientParallax
@@ -114,6 +114,12 @@ class MultiViewDepth:
             FormatError: fewer than two images, images of different size, or a blank one.
             InsufficientParallax: the views do not constrain depth.
         """
+        with one_blas_thread():
+            return self._recover(reference, sources, camera, T_source_reference)
+
+    def _recover(
+        self, reference: UInt8, sources: Sequence[UInt8], camera: Camera | None, T_source_reference: Float64 | None
+    ) -> Recovered:
         check_images([reference, *sources])
         T = None if camera is None else T_source_reference
         size = Size(reference.shape[1], reference.shape[0])

@@ -1,4 +1,4 @@
-"""Work on several images, or several parts of one, at the same time."""
+"""Work on several images, or several parts of one, at the same time, with results that do not depend on the cores."""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -6,7 +6,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from contextlib import AbstractContextManager
+from functools import cache
+from typing import Any, TypeVar
+
+import scipy.linalg  # noqa: F401  # brings a BLAS of its own, which has to be loaded before it can be limited
+from threadpoolctl import ThreadpoolController
 
 _T = TypeVar("_T")
 _R = TypeVar("_R")
@@ -16,3 +21,13 @@ def each(function: Callable[[_T], _R], items: Iterable[_T]) -> list[_R]:
     """``function`` of every item, in their order: NumPy and OpenCV let go of the interpreter while they compute."""
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         return list(pool.map(function, items))
+
+
+@cache
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """While it is entered BLAS uses one thread: with more, the order of its sums follows their number."""
+    return _blas().limit(limits=1, user_api="blas")

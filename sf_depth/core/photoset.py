@@ -19,6 +19,7 @@ from sf_depth.core import products
 from sf_depth.core.filling import Filler
 from sf_depth.core.matching import grey
 from sf_depth.core.mvd import CONTRADICTED, MultiViewDepth, Recovered, check_images
+from sf_depth.core.parallel import one_blas_thread
 from sf_depth.core.scale import GlobalScale, from_translations, in_unit
 from sf_depth.core.seeds import Features, detect, match_features
 from sf_interfaces.errors import FormatError, InsufficientParallax
@@ -73,6 +74,10 @@ class PhotoSetDepth:
             FormatError: fewer than two images, or images that do not fit together.
             InsufficientParallax: no image has depth.
         """
+        with one_blas_thread():
+            return self._estimate(frames, heard)
+
+    def _estimate(self, frames: Sequence[Frame], heard: Callable[[int], None]) -> PhotoSet:
         images = [frame.image for frame in frames if frame.image is not None]
         if len(images) < len(frames):
             raise FormatError("multi-view depth needs colour images; the input has frames without one")

@@ -72,7 +72,7 @@ def log(T: Array) -> Array:
 
 
 def log_near_identity(T: Array) -> Array:
-    """:func:`log` for angles below a radian, to 1e-5 of the translation there; several times as fast for a few motions."""
+    """:func:`log` for angles below a radian, to 1e-5 of the translation there; faster for a few motions."""
     T = np.asarray(T, dtype=np.float64)
     R, t = T[..., :3, :3], T[..., :3, 3]
     v = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 from views import Views, room, rotation_error_deg
 
 from sf_depth.config import DepthConfig
@@ -43,6 +44,15 @@ def test_depth_is_right_in_all_three_settings(mode: str) -> None:
     assert rotation_error_deg(found.T_source_reference, views.T_source_reference) < 0.3
     assert abs(found.camera.fx / views.camera.fx - 1) < 0.01
     assert (found.focal_sigma > 0) == (mode == "unknown")
+
+
+def test_the_number_of_threads_changes_nothing() -> None:
+    views, found = room(), []
+    for threads in (1, 2):
+        with threadpool_limits(threads):
+            found.append(MVD.recover(views.images[0], views.images[1:]))
+    np.testing.assert_array_equal(found[0].depth.z, found[1].depth.z)
+    assert found[0].camera == found[1].camera
 
 
 def test_variance_grows_where_parallax_is_poor() -> None:
