@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -296,13 +297,18 @@ def test_the_orchestrator_builds_the_line_from_live_topics(live: Path, environme
     assert wait_for(lambda: b"started tracking, depth, recon" in log.read_bytes(), 90), log.read_text()
     text = log.read_text()
     assert "tracking, because POSE is missing and recon needs it" in text
-    table = subprocess.run(
-        [sys.executable, "-m", "sf_bringup.graph_table", "--json"],
-        env=environment, capture_output=True, text=True, timeout=60,
-    )  # fmt: skip
-    assert table.returncode == 0, table.stdout + table.stderr
-    found = json.loads(table.stdout)
-    assert {"/sf/tracking", "/sf/depth", "/sf/recon", "/sf_orchestrator"} <= set(found["nodes"])
+    found: dict[str, Any] = {}
+
+    def seen() -> bool:  # what a busy machine has not discovered in one look it has in the next
+        table = subprocess.run(
+            [sys.executable, "-m", "sf_bringup.graph_table", "--json"],
+            env=environment, capture_output=True, text=True, timeout=60,
+        )  # fmt: skip
+        assert table.returncode == 0, table.stdout + table.stderr
+        found.update(json.loads(table.stdout))
+        return {"/sf/tracking", "/sf/depth", "/sf/recon", "/sf_orchestrator"} <= set(found["nodes"])
+
+    assert wait_for(seen, 60), found
     for topic in ("/sf/tracking/pose", "/sf/depth/dense/variance", "/sf/recon/surface", "/sf/line", "/diagnostics"):
         assert topic in found["topics"]
     # A node that dies comes back, and the others stay.
