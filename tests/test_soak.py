@@ -1,6 +1,6 @@
 """The soak of benchmarks/soak.py: nothing is lost, nothing dies, memory is that of the map.
 
-SF_SOAK=120 runs it for two minutes; without it the test skips, because a soak that is short says nothing.
+Two minutes; SF_SOAK=3600 makes it an hour.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -20,10 +20,9 @@ SOAK = Path(__file__).resolve().parents[1] / "benchmarks" / "soak.py"
 @pytest.mark.graph
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
-@pytest.mark.skipif("SF_SOAK" not in os.environ, reason="set SF_SOAK to the seconds of live line it may take")
 def test_a_live_line_loses_no_keyframe_and_keeps_its_memory(tmp_path: Path) -> None:
     environment = {**os.environ, "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
-    seconds, out = os.environ["SF_SOAK"], tmp_path / "soak.json"
+    seconds, out = os.environ.get("SF_SOAK", "120"), tmp_path / "soak.json"
     command = [sys.executable, str(SOAK), "--seconds", seconds, "--out", str(out)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
