@@ -65,8 +65,8 @@ LINES = (
 )
 
 
-# Name in the table -> folder below --data; each line runs on those that have what it needs.
 PHOTOS = 8  # images of a photo set, evenly from the recording
+# Name in the table -> folder below --data; each line runs on those that have what it needs.
 REAL = {"7-Scenes": "rgbd_7scenes_redkitchen_000_199", "KITTI odometry": "rgbl_kitti_odometry04_000_017"}
 
 

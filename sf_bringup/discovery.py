@@ -95,7 +95,6 @@ def is_wanted(kind: str) -> bool:
 
 def is_image(kind: str) -> bool:
     """Whether a message type is an image, raw or compressed."""
-    """Whether a message type is an image, raw or compressed."""
     return takes("rgb", kind)
 
 

@@ -110,10 +110,11 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
     out, compressed = str(folder.path.resolve()), given.mapping.compressed
     line = launches(made, given.mapping.roles, config, lossless=rate == 0, out=out, compressed=compressed)
     environment = node_environment()
+    poses = folder.path / "trajectory.tum"
 
     def estimated() -> bool:
         """An image set is all or nothing: without depth of any image the node leaves no file."""
-        return made.ids != (IMAGE_SET,) or (folder.path / "trajectory.tum").is_file()
+        return made.ids != (IMAGE_SET,) or poses.is_file()
 
     logs = folder.path / "log"
     with _parent_node() as node:
@@ -137,7 +138,6 @@ def run_graph(folder: RunFolder, given: BagInput, made: Plan, config: ConfigFile
         print(f"sf: {sentence}", file=sys.stderr)
     if not estimated():
         raise FormatError("; ".join(watch.errors) or f"no image of {given.bag} got depth")
-    poses = folder.path / "trajectory.tum"
     if poses.is_file() and not poses.stat().st_size:
         raise untracked(given)
     return {}
