@@ -254,6 +254,11 @@ class Frame:
         if self.T_map_camera is not None:
             _set(self, "T_map_camera", check_pose(self.T_map_camera, "T_map_camera"))
 
+    @property
+    def measured(self) -> bool:
+        """Whether it carries depth, dense or sparse."""
+        return self.depth is not None or self.sparse_depth is not None
+
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:

@@ -80,7 +80,7 @@ class Initialiser:
         Returns:
             Then, of the frames since the first keyframe, stamps, poses T_cw and what they saw of it.
         """
-        if frame.depth is not None or frame.sparse_depth is not None:
+        if frame.measured:
             keyframe = self._window.make(frame, view, np.eye(4))
             if keyframe is not None and int(keyframe.patches.measured.sum()) >= self._config.min_inliers:
                 self.scale = Scale.METRIC

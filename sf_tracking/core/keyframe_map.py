@@ -106,14 +106,14 @@ class KeyframeMap:
         half as long ago as the first time, counts as forgotten: things move, and keyframes get lost on their way.
         """
         older = max(0, len(self) - _JUST_MADE)
-        seen = [i for i in self._near(keyframe, config) if self._same_view(keyframe, i, config)]
+        seen = [i for i, T in self._near(keyframe, config) if _same_view(keyframe, T, config)]
         if not seen or seen[0] >= older:
             return False
         first, last = self.stamps[seen[0]], self.stamps[seen[-1]]
         return keyframe.stamp_ns - last <= max(config.renew_s * 1e9, last - first)
 
-    def _near(self, keyframe: Keyframe, config: TrackingConfig) -> list[int]:
-        """Keyframes, with depth if this one has it, that may see the same, oldest first."""
+    def _near(self, keyframe: Keyframe, config: TrackingConfig) -> list[tuple[int, Float64]]:
+        """Keyframes, with depth if this one has it, that may see the same, oldest first, and T_other_own."""
         cloud, camera = keyframe.landmarks, keyframe.camera
         if cloud is None or not len(cloud) or not len(self):
             return []
@@ -122,19 +122,7 @@ class KeyframeMap:
         near = np.linalg.norm(moved[:, :3, 3], axis=1) < turn * float(np.median(cloud.points[:, 2]))
         near &= moved[:, 2, 2] > np.cos(min(turn, np.pi))
         near &= np.array(self._measured) | (keyframe.depth is None)
-        return list(map(int, np.flatnonzero(near)))
-
-    def _same_view(self, keyframe: Keyframe, index: int, config: TrackingConfig) -> bool:
-        """Whether the landmarks of a keyframe lie in view of another one, and hardly elsewhere in its image."""
-        cloud, camera = keyframe.landmarks, keyframe.camera
-        assert cloud is not None
-        X = cloud.points.astype(np.float64)
-        T = se3.inverse(sim3.rigid(self.S[index])) @ keyframe.T_map_camera
-        uv, z = camera.project(se3.transform(T, X))
-        with np.errstate(invalid="ignore"):
-            seen = (z > 0) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
-        flow = np.linalg.norm(uv - camera.project(X)[0], axis=1)[seen]
-        return bool(seen.mean() >= config.keyframe_overlap and flow.mean() <= config.keyframe_flow * camera.width)
+        return [(int(i), moved[i]) for i in np.flatnonzero(near)]
 
     @property
     def news(self) -> bool:
@@ -318,3 +306,15 @@ def _odometry_sigma(keyframe: Keyframe) -> Float64:
     cloud, turn = keyframe.landmarks, _ODOMETRY_PX / keyframe.camera.fx
     depth = 1.0 if cloud is None or not len(cloud) else float(np.median(cloud.points[:, 2]))
     return np.array([*[turn * depth] * 3, *[turn] * 3, _ODOMETRY_STRETCH])
+
+
+def _same_view(keyframe: Keyframe, T_other_own: Float64, config: TrackingConfig) -> bool:
+    """Whether the landmarks of a keyframe lie in view of another one, and hardly elsewhere in its image."""
+    cloud, camera = keyframe.landmarks, keyframe.camera
+    assert cloud is not None
+    X = cloud.points.astype(np.float64)
+    uv, z = camera.project(se3.transform(T_other_own, X))
+    with np.errstate(invalid="ignore"):
+        seen = (z > 0) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+    flow = np.linalg.norm(uv - camera.project(X)[0], axis=1)[seen]
+    return bool(seen.mean() >= config.keyframe_overlap and flow.mean() <= config.keyframe_flow * camera.width)

@@ -173,7 +173,7 @@ def extract(frame: Frame, gray: UInt8, config: TrackingConfig) -> tuple[Float64,
     uv, score = _candidates(frame, gray, config)
     if len(uv) == 0:
         return uv.reshape(0, 2), measure(frame, uv.reshape(0, 2), config)
-    count = config.patches * (_FREE if frame.depth is None and frame.sparse_depth is None else 1)
+    count = config.patches * (1 if frame.measured else _FREE)
     chosen = _spread(score, uv, camera, round(_SPARES * count))
     uv = uv[chosen]
     found = measure(frame, uv, config)

@@ -219,8 +219,7 @@ class Tracker:
         newest = seen[-1]
         own = found.sights.keyframe == len(self._window) - 1
         flow = np.linalg.norm(found.sights.uv[own] - newest.patches.uv[found.sights.patch[own]], axis=1)
-        measured = frame.depth is not None or frame.sparse_depth is not None
-        wanted = wants_keyframe(self._config, newest, flow, found.overlap, measured=measured)
+        wanted = wants_keyframe(self._config, newest, flow, found.overlap, measured=frame.measured)
         done = self._window.work()
         if wanted and not done:
             self._window.complete()
