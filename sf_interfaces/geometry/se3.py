@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SMALL_ANGLE = 1e-4  # rad; below it the series is more exact than the closed form
+_SERIES = 0.05  # rad; below it the series is more exact than the closed form
+_NEAR_PI = 3.0  # rad
+_TINY = 1e-30
+_UNIT = np.eye(3)
 
 
 def _rotation() -> Any:
@@ -24,37 +27,32 @@ def _rotation() -> Any:
     return Rotation
 
 
+# hat(e_i) of the unit vectors, row after row.
+_GENERATORS = np.array(
+    [[0, 0, 0, 0, 0, -1, 0, 1, 0], [0, 0, 1, 0, 0, 0, -1, 0, 0], [0, -1, 0, 1, 0, 0, 0, 0, 0]], dtype=np.float64
+)
+
+
 def hat(w: Array) -> Array:
     """Skew-symmetric matrix of a 3-vector: ``hat(a) @ b == cross(a, b)``. [..., 3] -> [..., 3, 3]."""
     w = np.asarray(w, dtype=np.float64)
-    zero = np.zeros_like(w[..., 0])
-    x, y, z = w[..., 0], w[..., 1], w[..., 2]
-    rows = (np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1))
-    return np.stack(rows, -2)
-
-
-def _series(w: Array) -> tuple[Array, Array, Array]:
-    """sin(t)/t, (1-cos t)/t^2 and (t-sin t)/t^3 of the rotation vector's length t, each [..., 1, 1]."""
-    t2 = np.sum(w * w, axis=-1)[..., None, None]
-    t = np.sqrt(t2)
-    small = t < _SMALL_ANGLE
-    safe = np.where(small, 1.0, t)
-    a = np.where(small, 1 - t2 / 6, np.sin(safe) / safe)
-    b = np.where(small, 0.5 - t2 / 24, (1 - np.cos(safe)) / safe**2)
-    c = np.where(small, 1 / 6 - t2 / 120, (safe - np.sin(safe)) / safe**3)
-    return a, b, c
+    return np.asarray((w @ _GENERATORS).reshape(*w.shape, 3))
 
 
 def exp(xi: Array) -> Array:
     """Exponential map of SE(3). xi [..., 6] (translation m, rotation rad) -> [..., 4, 4]."""
     xi = np.asarray(xi, dtype=np.float64)
-    rho, w = xi[..., :3], xi[..., 3:]
-    a, b, c = _series(w)
+    w = xi[..., 3:]
+    t2 = (w * w).sum(axis=-1)[..., None, None]
+    t = np.sqrt(t2)
+    a, half = np.sinc(t / np.pi), np.sinc(t / (2 * np.pi))  # sin(t)/t, and of half of it: b = (1 - cos t)/t^2
+    b = 0.5 * half * half
+    c = np.where(t < _SERIES, 1 / 6 - t2 / 120 + t2 * t2 / 5040, (1 - a) / np.maximum(t2, _SERIES**2))
     W = hat(w)
     W2 = W @ W
     T = np.zeros((*xi.shape[:-1], 4, 4))
-    T[..., :3, :3] = np.eye(3) + a * W + b * W2
-    T[..., :3, 3] = ((np.eye(3) + b * W + c * W2) @ rho[..., None])[..., 0]
+    T[..., :3, :3] = _UNIT + a * W + b * W2
+    T[..., :3, 3:] = (_UNIT + b * W + c * W2) @ xi[..., :3, None]
     T[..., 3, 3] = 1.0
     return T
 
@@ -62,26 +60,27 @@ def exp(xi: Array) -> Array:
 def log(T: Array) -> Array:
     """Logarithm of SE(3), inverse of :func:`exp` for angles below pi. [..., 4, 4] -> [..., 6]."""
     T = np.asarray(T, dtype=np.float64)
-    batch = T.shape[:-2]
-    w = _rotation().from_matrix(T[..., :3, :3].reshape(-1, 3, 3)).as_rotvec().reshape(*batch, 3)
-    _, b, c = _series(w)
+    w = _rotation_vector(T[..., :3, :3])
+    t2 = (w * w).sum(axis=-1)[..., None, None]
+    half = np.maximum(0.5 * np.sqrt(t2), 0.5 * _SERIES)
+    k = np.where(t2 < _SERIES**2, 1 / 12 + t2 / 720 + t2 * t2 / 30240, (0.25 - 0.25 * half / np.tan(half)) / half**2)
     W = hat(w)
-    V = np.eye(3) + b * W + c * (W @ W)
-    rho = np.linalg.solve(V, T[..., :3, 3][..., None])[..., 0]
-    return np.concatenate([rho, w], axis=-1)
+    turned = W @ T[..., :3, 3:]
+    rho = T[..., :3, 3:] - 0.5 * turned + k * (W @ turned)
+    return np.concatenate([rho[..., 0], w], axis=-1)
 
 
-def log_near_identity(T: Array) -> Array:
-    """:func:`log` for angles below a radian, to 1e-5 of the translation there; faster for a few motions."""
-    T = np.asarray(T, dtype=np.float64)
-    R, t = T[..., :3, :3], T[..., :3, 3]
-    v = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
-    sine = np.sqrt((v * v).sum(axis=-1, keepdims=True))
-    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1)[..., None] - 1.0))
-    w = v * np.where(sine > _SMALL_ANGLE, angle / np.where(sine > _SMALL_ANGLE, sine, 1.0), 1.0)
-    turned = np.cross(w, t)
-    rho = t - 0.5 * turned + (1 / 12 + angle**2 / 720 + angle**4 / 30240) * np.cross(w, turned)
-    return np.concatenate([rho, w], axis=-1)
+def _rotation_vector(R: Array) -> Array:
+    """Axis times angle of rotations [..., 3, 3] -> [..., 3]."""
+    v = 0.5 * (R[..., (2, 0, 1), (1, 2, 0)] - R[..., (1, 2, 0), (2, 0, 1)])
+    sine = np.sqrt((v * v).sum(axis=-1))
+    cosine = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
+    angle = np.arctan2(sine, cosine)
+    w = v * (np.maximum(angle, _TINY) / np.maximum(sine, _TINY))[..., None]
+    turned = angle > _NEAR_PI  # where the sine tells the axis badly
+    if turned.any():
+        w[turned] = _rotation().from_matrix(R[turned]).as_rotvec()
+    return np.asarray(w)
 
 
 def inverse(T: Array) -> Array:
@@ -90,7 +89,7 @@ def inverse(T: Array) -> Array:
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     out = np.zeros_like(T)
     out[..., :3, :3] = Rt
-    out[..., :3, 3] = -(Rt @ T[..., :3, 3:])[..., 0]
+    out[..., :3, 3:] = -(Rt @ T[..., :3, 3:])
     out[..., 3, 3] = 1.0
     return out
 

@@ -10,6 +10,7 @@ normal matrix belongs to the patch alone and is inverted once. Each iteration sa
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +46,18 @@ class Alignment:
     explained: Float64  # [E] share of the variance of the pixels that the template explains, 0 to 1
 
 
+class Limits(NamedTuple):
+    """What an alignment must keep to be believed."""
+
+    border: float  # px from the edge of the image
+    reach: float  # px from its start
+    explained: float  # share of the variance that the template must explain, where
+    noise: float  # the residual is larger than this, grey levels
+    residual: float  # grey levels, at most
+    gain: float  # change of contrast at most, up or down
+    own: float  # px, deviation that every position has beside what its residual shows
+
+
 def describe(image: Float32, uv: Float64, side: int) -> Templates:
     """Templates of patches at ``uv`` [M, 2] continuous px of an image [H, W]."""
     return Templates(*native().describe(image, dense(uv), side), np.arange(len(uv)))
@@ -54,3 +67,12 @@ def align(image: Float32, templates: Templates, start: Float64, warp: Float64, i
     """Find templates in ``image`` [H, W] near ``start`` [E, 2] px, warped by ``warp`` [E, 2, 2]."""
     t = templates
     return Alignment(*native().align(image, t.J, t.inverse, t.rows, dense(start), dense(warp), iterations))
+
+
+def judge(
+    found: Alignment, start: Float64, shape: tuple[int, ...], limits: Limits
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """Information [E, 2, 2] of aligned centres in an image of ``shape`` [H, W], and which [E] are to be believed."""
+    arrays = (dense(start), found.centre, found.covariance, found.gain, found.residual, found.explained)
+    information, valid = native().judge(*arrays, shape[1], shape[0], np.array(limits))
+    return information, valid

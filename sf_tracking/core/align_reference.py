@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sf_interfaces.types import Float32, Float64
-from sf_tracking.core.align import Alignment, Templates
+from sf_tracking.core.align import Alignment, Limits, Templates
 
 _STOP_PX = 0.01
 _RIDGE = 1e-3  # (grey level / px)^2 per pixel; keeps the normal matrix of a flat patch invertible
@@ -77,3 +78,15 @@ def align(image: Float32, templates: Templates, start: Float64, warp: Float64, i
     spread_px = np.where(known, noise / np.maximum(gain**2, 1e-4), np.nan)
     covariance = warp @ normal_inverse[:, :2, :2] @ warp.transpose(0, 2, 1) * spread_px[:, None, None]
     return Alignment(centre, covariance, gain, np.sqrt(noise), explained)
+
+
+def judge(
+    found: Alignment, start: Float64, shape: tuple[int, ...], limits: Limits
+) -> tuple[Float64, NDArray[np.bool_]]:
+    """See :func:`.align.judge`."""
+    low, high = limits.border, np.array(shape[::-1]) - limits.border
+    ok = (found.centre >= low).all(axis=1) & (found.centre <= high).all(axis=1)
+    ok &= (found.explained > limits.explained) | (found.residual < limits.noise)
+    ok &= (found.residual < limits.residual) & (found.gain > 1 / limits.gain) & (found.gain < limits.gain)
+    ok &= np.linalg.norm(found.centre - start, axis=1) < limits.reach
+    return np.linalg.inv(found.covariance + limits.own**2 * np.eye(2)), ok

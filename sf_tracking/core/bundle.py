@@ -79,7 +79,7 @@ def motion_error(p: Problem, T_ts: Float64) -> tuple[Float64, Float64]:
     e = np.zeros((*T_ts.shape[:2], 6))
     known = p.motion_information.any(axis=(2, 3))
     if known.any():
-        e[known] = se3.log_near_identity(T_ts[known] @ se3.inverse(p.motion[known]))
+        e[known] = se3.log(T_ts[known] @ se3.inverse(p.motion[known]))
     return e, (p.motion_information @ e[..., None])[..., 0]
 
 

@@ -8,6 +8,7 @@ frame, so that tracking never waits for it; a loop it finds takes effect with th
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Keyframe, Scale
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core import sim3
+from sf_tracking.core.beside import beside
 from sf_tracking.core.places import Features, Index, Place, features, place_of_keyframe
 from sf_tracking.core.pose_graph import Edges, optimise
 from sf_tracking.core.recognise import Sighting, sight
@@ -97,7 +99,7 @@ class KeyframeMap:
         elif n:
             self._tie(n - 1, n, T, np.sqrt(_odometry_sigma(keyframe) ** 2 + self._gap), loop=False)
         self._gap = np.zeros(7)
-        self._parts = self._search(keyframe, n)
+        self._parts = self._search(keyframe, beside(_describe, keyframe), n)
 
     def knows(self, keyframe: Keyframe, config: TrackingConfig) -> bool:
         """Whether an older keyframe already sees what this one does: too little flow and enough overlap.
@@ -200,10 +202,8 @@ class KeyframeMap:
 
     # ---- the search for a loop
 
-    def _search(self, keyframe: Keyframe, n: int) -> Iterator[None]:
-        found = features(keyframe.image)
-        place = place_of_keyframe(keyframe, found)
-        yield
+    def _search(self, keyframe: Keyframe, described: Future[tuple[Features, Place]], n: int) -> Iterator[None]:
+        found, place = described.result()
         scores = self._index.scores(place.descriptors)
         self._index.add(place.descriptors)
         self.places.append(place)
@@ -299,6 +299,11 @@ class KeyframeMap:
     def poses(self) -> dict[int, Float64]:
         """T_map_camera of every keyframe, by stamp."""
         return dict(zip(self.stamps, sim3.rigid(self.S), strict=True)) if self.stamps else {}
+
+
+def _describe(keyframe: Keyframe) -> tuple[Features, Place]:
+    found = features(keyframe.image)
+    return found, place_of_keyframe(keyframe, found)
 
 
 def _odometry_sigma(keyframe: Keyframe) -> Float64:

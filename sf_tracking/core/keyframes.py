@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, DepthMap, Float64, Frame, Keyframe, PointCloud, Scale
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.bundle import project
+from sf_tracking.core.native import dense, intrinsics, native
 from sf_tracking.core.patches import Patches
 from sf_tracking.core.shape import Shape, ShapeFit, shape_of
 from sf_tracking.core.update import View
 
 _LANDMARK_SIGMA = 0.2  # relative deviation of inverse depth up to which a patch is published as a landmark
-_SHEAR = (0.2, 5.0)  # change of a patch's area between two views, beyond which it is not looked for
+SHEAR = (0.2, 5.0)  # change of a patch's area between two views, beyond which it is not looked for
 _WAITED = 2.0  # flow and loss of overlap, relative to what makes a keyframe, up to which depth is waited for
 _MIN_FLOW = 0.25  # of the flow that makes a keyframe: without it a loss of overlap is no reason for one
 
@@ -74,22 +74,18 @@ class Reprojection:
 
 
 def reproject(keyframe: TrackedKeyframe, T_cw: Float64) -> Reprojection:
-    """All patches of a keyframe in the view of a camera at T_cw: Pi(G_ij Pi^-1(P'_k)) with its derivatives."""
+    """All patches of a keyframe in the view of a camera at T_cw: Pi(G_ij Pi^-1(P'_k)) with its derivatives.
+
+    Compiled; :mod:`.reproject_reference` is the same in numpy.
+    """
     camera, patches = keyframe.camera, keyframe.patches
     T = T_cw @ se3.inverse(keyframe.T_cw)
-    uv, X = project(camera, T, patches.rays(camera), patches.w)
-    z = np.where(np.isfinite(uv[:, 0]), X[:, 2], 1.0)
-    focal = np.array([camera.fx, camera.fy])
-    along = T[:3, :2] / focal + T[:3, 3][:, None] * patches.slope[:, None, :]  # [M, 3, 2] dX/d(uv)
-    scaled = focal / z[:, None]  # [M, 2]
-    on_axis = X[:, :2] / z[:, None]  # [M, 2]
-    warp = scaled[..., None] * (along[:, :2] - on_axis[..., None] * along[:, 2:])
-    J_w = scaled * (T[:2, 3] - on_axis * T[2, 3])
-    area = warp[:, 0, 0] * warp[:, 1, 1] - warp[:, 0, 1] * warp[:, 1, 0]
-    with np.errstate(invalid="ignore"):
-        visible = (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
-    visible &= (area > _SHEAR[0]) & (area < _SHEAR[1])
-    return Reprojection(uv, warp, J_w, patches.w / z, visible)
+    return Reprojection(
+        *native().reproject(
+            intrinsics(camera), T, dense(patches.uv), dense(patches.w), dense(patches.slope),
+            camera.width, camera.height, *SHEAR,
+        )
+    )  # fmt: skip
 
 
 def wants_keyframe(

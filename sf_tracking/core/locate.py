@@ -230,9 +230,14 @@ class Locator:
         for index, keyframe in enumerate(window):
             mine = sights.keyframe == index
             sigma[mine] = keyframe.patches.sigma[sights.patch[mine]]
-        along = sights.J_w * sigma[:, None]
-        covariance = np.linalg.inv(sights.information) + along[:, :, None] * along[:, None, :]
-        return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, np.linalg.inv(covariance), scales)
+        information = _less_sure(sights.information, sights.J_w * sigma[:, None])
+        return solve_pose(window[-1].camera, T_cw, X, w, sights.uv, information, scales)
+
+
+def _less_sure(information: Float64, along: Float64) -> Float64:
+    """Information [E, 2, 2] of positions that err by ``along`` [E, 2] px in addition: (I^-1 + a a^T)^-1."""
+    Ia = (information @ along[:, :, None])[:, :, 0]
+    return np.asarray(information - Ia[:, :, None] * Ia[:, None] / (1.0 + (along * Ia).sum(axis=1))[:, None, None])
 
 
 def _placed(window: Sequence[Placed], sights: Sights) -> tuple[Float64, Float64]:

@@ -9,6 +9,7 @@ known place, the keyframes are corrected, and all frames with them.
 from __future__ import annotations
 
 from collections import deque
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, PointCloud, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core import sim3, snapshot
+from sf_tracking.core.beside import beside
 from sf_tracking.core.keyframe_map import KeyframeMap, Recognised
 from sf_tracking.core.places import Features, Place, features, place_of_frame, place_of_keyframe
 from sf_tracking.core.recognise import Sighting, sight
@@ -36,7 +38,8 @@ class TrackingSession:
     def __init__(self, config: TrackingConfig) -> None:
         self._config = config
         self._map = KeyframeMap(loops=config.loops)
-        self._views: deque[tuple[Place, Float64]] = deque(maxlen=_VIEWS)  # with their T_map_camera
+        # Of the last seconds: stamp, what was seen there, T_map_camera.
+        self._views: deque[tuple[int, Future[Place | None], Float64]] = deque(maxlen=_VIEWS)
         self._poses: dict[int, Float64] = {}  # stamp ns -> T_map_camera, of trackers that have ended
         self._T_map_odom = np.eye(4)
         self._camera: Camera | None = None
@@ -167,7 +170,7 @@ class TrackingSession:
             self._poses = dict(
                 zip(self._poses, sim3.rigid(motion[owner] @ np.array(list(self._poses.values()))), strict=True)
             )
-        self._views = deque(((place, sim3.rigid(motion[-1] @ T)) for place, T in self._views), maxlen=_VIEWS)
+        self._views = deque(((stamp, seen, sim3.rigid(motion[-1] @ T)) for stamp, seen, T in self._views), _VIEWS)
         metric = self._map.scale is Scale.METRIC
         return Correction(self.keyframe_trajectory(), np.ones(len(stamps)) if metric else sim3.scale_of(self._map.S))
 
@@ -227,9 +230,12 @@ class TrackingSession:
 
     def _among_views(self, seen: Features, camera: Camera) -> Sighting | None:
         """An image that shows what was seen in the last seconds."""
-        if not self._views:
-            return None
-        return sight([p for p, _ in self._views], np.array([T for _, T in self._views]), seen, camera)
+        views = self._known_views()
+        return sight([p for p, _ in views], np.array([T for _, T in views]), seen, camera) if views else None
+
+    def _known_views(self) -> list[tuple[Place, Float64]]:
+        """What was seen in the last seconds, with T_map_camera."""
+        return [(place, T) for _, seen, T in self._views if (place := seen.result()) is not None]
 
     def _unknown(self, update: TrackingUpdate, ended: tuple[Keyframe, ...]) -> TrackingUpdate:
         """Nothing can be said in the map's frame."""
@@ -237,17 +243,17 @@ class TrackingSession:
 
     def _look(self, frame: Frame, T_map_camera: Float64 | None) -> None:
         """Remember a tracked frame now and then."""
-        if T_map_camera is None or (self._views and frame.stamp_ns - self._views[-1][0].stamp_ns < _VIEW_EVERY_NS):
+        if T_map_camera is None or (self._views and frame.stamp_ns - self._views[-1][0] < _VIEW_EVERY_NS):
             return
-        if (place := place_of_frame(frame)) is not None:
-            self._views.append((place, T_map_camera))
+        if frame.measured:
+            self._views.append((frame.stamp_ns, beside(place_of_frame, frame), T_map_camera))
 
     # ---- snapshots
 
     def save(self, path: Path) -> None:
         """Write what a successor process needs: the trajectory, the map of keyframes and its places, no pickle."""
         trajectory = self.trajectory()
-        snapshot.write(path, self._map, trajectory, list(self._views))
+        snapshot.write(path, self._map, trajectory, self._known_views())
 
     @staticmethod
     def restore(config: TrackingConfig, path: Path) -> TrackingSession:
@@ -258,7 +264,7 @@ class TrackingSession:
         """
         out = TrackingSession(config)
         out._poses, views = snapshot.read(path, out._map)
-        out._views.extend(views)
+        out._views.extend((place.stamp_ns, beside(lambda known: known, place), T) for place, T in views)
         out._near = False
         out._begin(None if out._poses else np.eye(4))
         return out

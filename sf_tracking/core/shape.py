@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float32, Float64, Frame
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.native import dense, intrinsics, native
+from sf_tracking.core.native import intrinsics, native
 
 _COLUMNS = 80  # of the grid on which dense depth is compared
 _EDGE = 0.05  # relative step of depth between cells, beyond which they belong to different surfaces
@@ -102,13 +102,13 @@ def _gridded(camera: Camera, z: Float32, sigma: float) -> Shape:
     return Shape(points, normal[good], index, None, sigma * points[:, 2] ** 2, _LEAST, _INDEPENDENT)
 
 
-def _partners(camera: Camera, target: Shape, moved: Float64) -> NDArray[np.int64]:
-    """Index of the target's point for each moved point [K, 3], -1: none."""
+def _partners(camera: Camera, source: Shape, target: Shape, T: Float64) -> NDArray[np.int64]:
+    """Index of the target's point for each of the source's, moved by T, -1: none."""
     if target.tree is not None:
-        return np.asarray(target.tree.query(moved)[1])
+        return np.asarray(target.tree.query(se3.transform(T, source.points))[1])
     assert target.grid is not None
     h, w = target.grid.shape
-    found = native().partners(intrinsics(camera), dense(moved), target.grid, w / camera.width, h / camera.height)
+    found = native().partners(intrinsics(camera), T, source.points, target.grid, w / camera.width, h / camera.height)
     return np.asarray(found)
 
 
@@ -122,11 +122,10 @@ def fit(camera: Camera, source: Shape, target: Shape, T: Float64, prior: Float64
     trust *= source.independent
     away, H, share, overlap = np.zeros(6), np.zeros((6, 6)), 0.0, 0.0
     for step_index in range(_STEPS):
-        moved = se3.transform(T, source.points)
-        partner = _partners(camera, target, moved)
+        partner = _partners(camera, source, target, T)
         reach = (_FIRST_REACH if step_index == 0 else _REACH) + _SLACK
         H, g, used, met = native().plane_system(
-            dense(moved), source.sigma, partner, target.points, target.normals, reach, _SCALE, source.least, trust
+            T, source.points, source.sigma, partner, target.points, target.normals, reach, _SCALE, source.least, trust
         )
         share, overlap = used / max(1, met), met / len(source)
         if used < _MIN_POINTS or overlap < _OVERLAP:

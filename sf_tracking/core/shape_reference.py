@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float32, Float64
 from sf_tracking.core.bundle_reference import robust
 
@@ -25,10 +26,10 @@ def thin(z: Float32, step: int) -> tuple[NDArray[np.int64], Float64, Float64]:
     return count, mean, np.where(count > 0, high - np.where(count > 0, low, 0.0), 0.0)
 
 
-def partners(camera: Camera, moved: Float64, grid: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Index of the target's point on whose cell each moved point [K, 3] falls, -1: none."""
+def partners(camera: Camera, T: Float64, source: Float64, grid: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Index of the target's point on whose cell each source point [K, 3], moved by T, falls, -1: none."""
     h, w = grid.shape
-    uv, z = camera.project(moved)
+    uv, z = camera.project(se3.transform(T, source))
     with np.errstate(invalid="ignore"):
         cell = np.floor(np.nan_to_num(uv) * (w / camera.width, h / camera.height)).astype(np.int64)
         inside = (cell >= 0).all(axis=1) & (cell < (w, h)).all(axis=1) & (z > 0)
@@ -36,10 +37,10 @@ def partners(camera: Camera, moved: Float64, grid: NDArray[np.int64]) -> NDArray
 
 
 def plane_system(
-    moved: Float64, sigma: Float64, partner: NDArray[np.int64], points: Float64, normals: Float64, reach: float,
-    scale: float, least: float, trust: float,
+    T: Float64, source: Float64, sigma: Float64, partner: NDArray[np.int64], points: Float64, normals: Float64,
+    reach: float, scale: float, least: float, trust: float,
 ) -> tuple[Float64, Float64, int, int]:  # fmt: skip
-    """H [6, 6], g [6] of the robust distances of moved points [K, 3] to the planes of their partners.
+    """H [6, 6], g [6] of the robust distances of source points [K, 3], moved by T, to the planes of partners.
 
     And how many points count, and how many have a partner, however far.
 
@@ -48,7 +49,7 @@ def plane_system(
         reach: relative to depth, how far apart partners may lie.
         least: share of ``sigma`` that is believed at least.
     """
-    n, p = normals[partner], points[partner]
+    n, p, moved = normals[partner], points[partner], se3.transform(T, source)
     r = ((p - moved) * n).sum(axis=1)
     with np.errstate(invalid="ignore"):
         met = (partner >= 0) & np.isfinite(r) & (sigma > 0)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.types import Float32, Float64, UInt8
 from sf_tracking.config import TrackingConfig
-from sf_tracking.core.align import Templates, align, describe
+from sf_tracking.core.align import Limits, Templates, align, describe, judge
 from sf_tracking.core.patches import to_gray
 
 _CONTRAST, _MIDDLE = 45.0, 128.0  # grey levels of a normalised image: standard deviation and mean
@@ -86,7 +86,16 @@ class PatchAlignment:
     """
 
     def __init__(self, config: TrackingConfig) -> None:
-        self._config = config
+        self._config = c = config
+        self._limits = Limits(
+            c.patch_px / 2,
+            _REACH * c.patch_px,
+            c.min_explained,
+            c.image_sigma,
+            c.max_residual,
+            _MAX_GAIN,
+            c.position_sigma,
+        )
 
     def view(self, image: UInt8) -> View:
         """See :class:`UpdateOperator`; changes of exposure do not read as motion in the search either."""
@@ -103,16 +112,9 @@ class PatchAlignment:
 
     def __call__(self, patches: Templates, target: View, start: Float64, warp: Float64) -> Update:
         """See :class:`UpdateOperator`."""
-        c = self._config
-        found = align(target.fine, patches, start, warp, c.iterations)
-        height, width = target.fine.shape
-        border = c.patch_px / 2
-        inside = (found.centre >= border).all(axis=1) & (found.centre <= (width - border, height - border)).all(axis=1)
-        alike = (found.explained > c.min_explained) | (found.residual < c.image_sigma)
-        ok = inside & alike & (found.residual < c.max_residual) & (found.gain > 1 / _MAX_GAIN)
-        ok &= (found.gain < _MAX_GAIN) & (np.linalg.norm(found.centre - start, axis=1) < _REACH * c.patch_px)
-        covariance = found.covariance + c.position_sigma**2 * np.eye(2)
-        return Update(found.centre, np.linalg.inv(covariance), ok)
+        found = align(target.fine, patches, start, warp, self._config.iterations)
+        information, valid = judge(found, start, target.fine.shape, self._limits)
+        return Update(found.centre, information, valid)
 
 
 def search(

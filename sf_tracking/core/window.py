@@ -10,12 +10,13 @@ import numpy as np
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float64, Frame
 from sf_tracking.config import TrackingConfig
+from sf_tracking.core.beside import beside
 from sf_tracking.core.bundle import Problem, adjusting, information_root
 from sf_tracking.core.keyframes import TrackedKeyframe, reproject
 from sf_tracking.core.locate import Location, align_sights
 from sf_tracking.core.patches import Measured, Patches, extract
 from sf_tracking.core.relief import known_points, surface_at
-from sf_tracking.core.shape import fit
+from sf_tracking.core.shape import ShapeFit, fit
 from sf_tracking.core.update import UpdateOperator, View, search
 
 _GUESS = 0.5  # relative deviation of an inverse depth that is only expected from its neighbours
@@ -90,11 +91,12 @@ class Window:
             _remember(source, stamp, sights.patch[mine], sights.uv[mine], sights.information[mine])
         self.keyframes.append(keyframe)
         steps = iterations or self._config.bundle_iterations
-        parts = -(-(len(self.keyframes) - 1) // _AT_ONCE) + self._config.shape_keyframes + steps
+        parts = -(-(len(self.keyframes) - 1) // _AT_ONCE) + steps
         # As many frames as lay between the last two keyframes lie before the next, which has work enough of its own.
         self._pace, self._calls = -(-parts // max(1, self._calls - 1)), 0
         self._idle = False
         self._parts = self._integrate(keyframe, found, fixed, steps)
+        next(self._parts)  # surfaces are aligned beside all that follows
 
     def work(self) -> bool:
         """Do the next parts of a new keyframe's work; True when nothing is left.
@@ -115,28 +117,19 @@ class Window:
     def _integrate(self, keyframe: TrackedKeyframe, found: Location, fixed: int, iterations: int) -> Iterator[None]:
         """Look for the patches of a new keyframe in the window, align its surface, adjust the bundle."""
         others = self.keyframes[:-1]
+        near = (
+            others[-self._config.shape_keyframes :] if self._config.shape_keyframes and self._config.shape_trust else []
+        )
+        aligned = [beside(_surface_motion, keyframe, other, other.T_cw, keyframe.T_cw, self._config) for other in near]
+        yield
         for count, target in enumerate(reversed(others), start=1):
             self._observe(keyframe, target, found.excess)
             if count % _AT_ONCE == 0:
                 yield
-        for target in others[-self._config.shape_keyframes :] if self._config.shape_trust else ():
-            self._align_shapes(keyframe, target, found)
-            yield
+        for target, moved in zip(near, aligned, strict=True):
+            _believe(keyframe, target, found, moved.result())
         yield from self._optimise(fixed, iterations)
         self._tilt()
-
-    def _align_shapes(self, keyframe: TrackedKeyframe, target: TrackedKeyframe, found: Location) -> None:
-        """The relative motion of two keyframes from their measured surfaces.
-
-        Surfaces that contradict patches which agree with each other are those of something that moves.
-        """
-        source_shape, target_shape = (k.measured_shape(self._config) for k in (keyframe, target))
-        if source_shape is None or target_shape is None:
-            return
-        T = target.T_cw @ se3.inverse(keyframe.T_cw)
-        moved = fit(keyframe.camera, source_shape, target_shape, T, np.eye(6), self._config.shape_trust)
-        if moved is not None and (found.doubtful or found.distance(T, moved.T) < _CONTRADICTION):
-            keyframe.moved[target.frame.stamp_ns] = moved
 
     def _observe(self, source: TrackedKeyframe, target: TrackedKeyframe, excess: float) -> None:
         """Look for the patches of ``source`` in ``target``; over levels where their depth is only guessed."""
@@ -218,3 +211,23 @@ def _remember(source: TrackedKeyframe, stamp: int, patch: Float64, uv: Float64, 
     where, how_sure = np.zeros((m, 2)), np.zeros((m, 2, 2))
     where[patch], how_sure[patch] = uv, information
     source.seen[stamp] = (where, how_sure)
+
+
+def _surface_motion(
+    source: TrackedKeyframe, target: TrackedKeyframe, T_target: Float64, T_source: Float64, config: TrackingConfig
+) -> ShapeFit | None:
+    """The relative motion of two keyframes, at T_cw now, from their measured surfaces; None where they tell none."""
+    shapes = source.measured_shape(config), target.measured_shape(config)
+    if shapes[0] is None or shapes[1] is None:
+        return None
+    return fit(source.camera, *shapes, T_target @ se3.inverse(T_source), np.eye(6), config.shape_trust)
+
+
+def _believe(keyframe: TrackedKeyframe, target: TrackedKeyframe, found: Location, moved: ShapeFit | None) -> None:
+    """Take the motion that surfaces tell.
+
+    Surfaces that contradict patches which agree with each other are those of something that moves.
+    """
+    T = target.T_cw @ se3.inverse(keyframe.T_cw)
+    if moved is not None and (found.doubtful or found.distance(T, moved.T) < _CONTRADICTION):
+        keyframe.moved[target.frame.stamp_ns] = moved

@@ -176,4 +176,19 @@ SF_SIMD void align(const Image& image, const float* J, const double* inverse, co
     }
 }
 
+void judge(const double* start, const Aligned& found, size_t edges, int width, int height, const Limits& limits,
+           double* information, bool* valid) {
+    for (size_t e = 0; e < edges; ++e) {
+        const double *at = found.centre + 2 * e, *cov = found.covariance + 4 * e, border = limits.border;
+        const double moved = std::hypot(at[0] - start[2 * e], at[1] - start[2 * e + 1]);
+        const bool inside = at[0] >= border && at[1] >= border && at[0] <= width - border && at[1] <= height - border;
+        const bool alike = found.explained[e] > limits.explained || found.residual[e] < limits.noise;
+        valid[e] = inside && alike && moved < limits.reach && found.residual[e] < limits.residual &&
+                   found.gain[e] > 1 / limits.gain && found.gain[e] < limits.gain;
+        const double own = limits.own * limits.own, a = cov[0] + own, b = cov[1], c = cov[2], d = cov[3] + own;
+        const double inverse[4] = {d, -b, -c, a}, area = a * d - b * c;
+        for (int i = 0; i < 4; ++i) information[4 * e + i] = inverse[i] / area;
+    }
+}
+
 }  // namespace sf

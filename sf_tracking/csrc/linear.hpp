@@ -66,9 +66,10 @@ inline void move(const double* xi, double* T) {
 
 // Derivative of a whitened reprojection by a small motion (translation, rotation) of the camera that sees it, at
 // (x, y) of the image plane; ``on`` whitens and holds the focal lengths, d is inverse depth there.
-SF_INLINE void by_pose(const double on[2][2], double d, double x, double y, double J[2][6]) {
+template <class Real>
+SF_INLINE void by_pose(const Real on[2][2], const Real& d, const Real& x, const Real& y, Real J[2][6]) {
     for (int i = 0; i < 2; ++i) {
-        const double a = on[i][0], b = on[i][1];
+        const Real a = on[i][0], b = on[i][1];
         J[i][0] = a * d;
         J[i][1] = b * d;
         J[i][2] = -d * (a * x + b * y);

@@ -34,9 +34,18 @@ SF_SIMD void thin(const float* z, int height, int width, int step, int32_t* know
         }
 }
 
-void partners(const double* moved, size_t count, const Grid& grid, int64_t* partner) {
+namespace {
+
+SF_INLINE void transform(const double* T, const double* p, double* q) {
+    for (int i = 0; i < 3; ++i) q[i] = T[4 * i] * p[0] + T[4 * i + 1] * p[1] + T[4 * i + 2] * p[2] + T[4 * i + 3];
+}
+
+}  // namespace
+
+void partners(const double* T, const double* points, size_t count, const Grid& grid, int64_t* partner) {
+    double p[3];
     for (size_t k = 0; k < count; ++k) {
-        const double* p = moved + 3 * k;
+        transform(T, points + 3 * k, p);
         partner[k] = -1;
         if (!(p[2] > 0)) continue;
         const double col = std::floor((grid.camera.fx * (p[0] / p[2]) + grid.camera.cx) * grid.to_col);
@@ -46,47 +55,59 @@ void partners(const double* moved, size_t count, const Grid& grid, int64_t* part
     }
 }
 
-void plane_system(const double* moved, const double* sigma, const int64_t* partner, size_t count, const Surface& target,
-                  double reach, double scale, double least, double trust, PlaneSystem& out) {
+SF_SIMD void plane_system(const double* T, const double* points, const double* sigma, const int64_t* partner,
+                          size_t count, const Surface& target, double reach, double scale, double least, double trust,
+                          PlaneSystem& out) {
     out.met = 0;
-    std::vector<double> off, sorted;
-    std::vector<size_t> used;
-    off.reserve(count);
-    used.reserve(count);
+    // Of the points that count, one after the other: distance to the plane, deviation, normal and moment of the plane.
+    std::vector<double> off, deviation, sorted, rows[6];
+    for (auto* values : {&off, &deviation, &rows[0], &rows[1], &rows[2], &rows[3], &rows[4], &rows[5]})
+        values->reserve(count);
+    double q[3];
     for (size_t k = 0; k < count; ++k) {
         if (partner[k] < 0 || static_cast<size_t>(partner[k]) >= target.count) continue;
-        const double *p = target.points + 3 * partner[k], *n = target.normals + 3 * partner[k], *q = moved + 3 * k;
+        transform(T, points + 3 * k, q);
+        const double *p = target.points + 3 * partner[k], *n = target.normals + 3 * partner[k];
         const double d[3] = {p[0] - q[0], p[1] - q[1], p[2] - q[2]};
         const double r = d[0] * n[0] + d[1] * n[1] + d[2] * n[2];
-        const double distance = std::sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2]);
         if (!std::isfinite(r) || !(sigma[k] > 0)) continue;
         ++out.met;
-        if (!(distance < reach * q[2])) continue;
+        const double far = reach * q[2];
+        if (!(far > 0 && d[0] * d[0] + d[1] * d[1] + d[2] * d[2] < far * far)) continue;
         off.push_back(r);
-        used.push_back(k);
+        deviation.push_back(sigma[k]);
+        const double J[6] = {n[0], n[1], n[2], q[1] * n[2] - q[2] * n[1], q[2] * n[0] - q[0] * n[2],
+                             q[0] * n[1] - q[1] * n[0]};
+        for (int i = 0; i < 6; ++i) rows[i].push_back(J[i]);
     }
     std::fill_n(out.H, 36, 0.0);
     std::fill_n(out.g, 6, 0.0);
-    out.used = static_cast<int64_t>(used.size());
-    if (used.empty()) return;
+    out.used = static_cast<int64_t>(off.size());
+    if (off.empty()) return;
     sorted.resize(off.size());
-    for (size_t i = 0; i < used.size(); ++i) sorted[i] = std::abs(off[i]) / sigma[used[i]];
+    for (size_t i = 0; i < off.size(); ++i) sorted[i] = std::abs(off[i]) / deviation[i];
     const size_t half = sorted.size() / 2;
     std::nth_element(sorted.begin(), sorted.begin() + half, sorted.end());
     double middle = sorted[half];
     if (sorted.size() % 2 == 0) middle = 0.5 * (middle + *std::max_element(sorted.begin(), sorted.begin() + half));
     const double rough = std::max(1.4826 * middle, least);
-    for (size_t i = 0; i < used.size(); ++i) {
-        const size_t k = used[i];
-        const double *n = target.normals + 3 * partner[k], *q = moved + 3 * k, r = off[i];
-        const double deviation = sigma[k] * rough, far = r / (deviation * scale);
-        const double weight = trust / ((1.0 + far * far) * deviation * deviation);
-        const double J[6] = {n[0], n[1], n[2], q[1] * n[2] - q[2] * n[1], q[2] * n[0] - q[0] * n[2],
-                             q[0] * n[1] - q[1] * n[0]};
+    Double8 H[6][6] = {}, g[6] = {}, J[6];
+    for (size_t k = 0; k < off.size(); k += 8) {
+        const int left = static_cast<int>(std::min<size_t>(8, off.size() - k));
+        const Double8 r = gather8(off.data() + k, 1, left);
+        Double8 s = gather8(deviation.data() + k, 1, left) * rough;
+        for (int i = left; i < 8; ++i) s[i] = 1.0;  // of no point; its row is 0
+        const Double8 far = r / (s * scale), weight = trust / ((1.0 + far * far) * s * s);
+        for (int a = 0; a < 6; ++a) J[a] = gather8(rows[a].data() + k, 1, left);
         for (int a = 0; a < 6; ++a) {
-            out.g[a] += weight * J[a] * r;
-            for (int b = 0; b <= a; ++b) out.H[6 * a + b] += weight * J[a] * J[b];
+            const Double8 weighted = weight * J[a];
+            g[a] += weighted * r;
+            for (int b = 0; b <= a; ++b) H[a][b] += weighted * J[b];
         }
+    }
+    for (int a = 0; a < 6; ++a) {
+        out.g[a] = sum(g[a]);
+        for (int b = 0; b <= a; ++b) out.H[6 * a + b] = sum(H[a][b]);
     }
     for (int a = 0; a < 6; ++a)
         for (int b = a + 1; b < 6; ++b) out.H[6 * a + b] = out.H[6 * b + a];

@@ -25,8 +25,8 @@ struct Grid {
     Camera camera;
 };
 
-// The target's point that each moved source point falls on, -1: none.
-void partners(const double* moved, size_t count, const Grid& grid, int64_t* partner);
+// The target's point that each source point falls on, moved by T [4, 4]; -1: none.
+void partners(const double* T, const double* points, size_t count, const Grid& grid, int64_t* partner);
 
 struct PlaneSystem {
     double H[36], g[6];
@@ -34,10 +34,10 @@ struct PlaneSystem {
     int64_t met;   // points with a partner, however far
 };
 
-// Normal equations of the robust distances of moved points [count, 3] to the planes of their partners.
+// Normal equations of the robust distances of points [count, 3], moved by T, to the planes of their partners.
 // reach: how far apart they may lie, relative to the depth of the point. The points deviate by the share of ``sigma``
 // that their distances show, but by no less than the share ``least``.
-void plane_system(const double* moved, const double* sigma, const int64_t* partner, size_t count, const Surface& target,
-                  double reach, double scale, double least, double trust, PlaneSystem& out);
+void plane_system(const double* T, const double* points, const double* sigma, const int64_t* partner, size_t count,
+                  const Surface& target, double reach, double scale, double least, double trust, PlaneSystem& out);
 
 }  // namespace sf

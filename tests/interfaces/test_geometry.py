@@ -16,7 +16,8 @@ unit = st.floats(-1.0, 1.0)
 shift = st.floats(-100.0, 100.0)
 angles = st.one_of(
     st.floats(0.0, 1e-9),
-    st.floats(1e-6, 1e-3),  # around the switch from series to closed form
+    st.floats(1e-6, 1e-3),  # where the closed form would cancel
+    st.floats(0.049, 0.051),  # around the switch from series to closed form
     st.floats(0.0, 3.0),
     st.floats(np.pi - 1e-3, np.pi - 1e-6),
 )
@@ -48,11 +49,11 @@ def test_log_inverts_exp(xi: np.ndarray) -> None:
 
 
 @given(motions)
-def test_the_fast_logarithm_equals_the_other_near_identity(T: np.ndarray) -> None:
+def test_a_stack_of_motions_equals_one_after_the_other(T: np.ndarray) -> None:
     xi = se3.log(T)
-    xi[3:] *= min(1.0, 0.5 / max(np.linalg.norm(xi[3:]), 1e-9))
-    near = se3.exp(np.stack([xi, 1e-9 * xi, 0 * xi]))
-    np.testing.assert_allclose(se3.log_near_identity(near), [xi, 1e-9 * xi, 0 * xi], atol=1e-7 * (1 + np.abs(xi).max()))
+    stack = np.stack([xi, 1e-9 * xi, 0 * xi])
+    np.testing.assert_allclose(se3.exp(stack), [se3.exp(x) for x in stack], atol=1e-12 * (1 + np.abs(xi).max()))
+    np.testing.assert_allclose(se3.log(se3.exp(stack)), stack, atol=1e-6)
 
 
 @given(motions)

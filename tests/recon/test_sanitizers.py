@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 KERNELS = {
     "recon": ("color_decoder", "ipr_bins", "ipr_cpu", "point_grid", "rows", "view_blend"),
-    "tracking": ("align", "bundle", "pose", "surface"),
+    "tracking": ("align", "bundle", "pose", "reproject", "surface"),
 }
 # Run-time choice of vectors is off: it picks the function before the sanitizer has started.
 FLAGS = [

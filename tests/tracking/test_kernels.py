@@ -9,9 +9,20 @@ import numpy as np
 import pytest
 
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import Camera
-from sf_tracking.core import align, align_reference, bundle, bundle_reference, pose, pose_reference, shape_reference
+from sf_interfaces.types import Camera, Frame
+from sf_tracking.core import (
+    align,
+    align_reference,
+    bundle,
+    bundle_reference,
+    pose,
+    pose_reference,
+    reproject_reference,
+    shape_reference,
+)
+from sf_tracking.core.keyframes import TrackedKeyframe, reproject
 from sf_tracking.core.native import intrinsics, native
+from sf_tracking.core.patches import Patches
 from tests.tracking.test_align import places, texture
 from tests.tracking.test_bundle import CAMERA, scene
 
@@ -61,6 +72,40 @@ def test_alignment_of_hostile_input_is_as_defined() -> None:
         assert np.isnan(found.centre[0]).all() and found.explained[0] == 0 and np.isinf(found.residual[0])
         known = np.isfinite(found.centre).all(axis=1)
         np.testing.assert_allclose(found.gain[known], wanted.gain[known], atol=0.02)
+
+
+def test_alignments_are_judged_as_defined() -> None:
+    rng = np.random.default_rng(3)
+    start, half = rng.uniform(-10, 170, (400, 2)), rng.normal(0, 0.5, (400, 2, 2))
+    found = align.Alignment(
+        start + rng.normal(0, 3, (400, 2)),
+        half @ half.transpose(0, 2, 1),
+        *rng.uniform(0, 5, (2, 400)),
+        rng.random(400),
+    )
+    found.centre[::9], found.residual[::13] = np.nan, np.inf
+    limits = align.Limits(5.5, 4.0, 0.5, 2.0, 4.5, 4.0, 0.05)
+    information, valid = align.judge(found, start, (120, 160), limits)
+    wanted = align_reference.judge(found, start, (120, 160), limits)
+    np.testing.assert_array_equal(valid, wanted[1])
+    np.testing.assert_allclose(information, wanted[0], rtol=1e-6)
+    assert 20 < valid.sum() < 300
+
+
+def test_patches_are_reprojected_as_defined() -> None:
+    rng, count = np.random.default_rng(4), 300
+    uv, w = rng.uniform(0, (160, 120), (count, 2)), rng.uniform(-0.2, 1.5, count)
+    w[:4] = np.nan, np.inf, 0.0, 1e300
+    patches = Patches(uv, rng.normal(0, 0.01, (count, 2)), w, w, w, w, w > 0)
+    frame = Frame(0, SMALL, np.zeros((120, 160), np.uint8))
+    for T in (se3.exp(rng.normal(0, 0.3, 6)), se3.exp(np.array([0, 0, -1.0, 0, 1.2, 0])), np.eye(4)):
+        keyframe = TrackedKeyframe(frame, None, patches, None, se3.exp(rng.normal(0, 0.2, 6)))
+        with np.errstate(all="ignore"):
+            wanted = reproject_reference.reproject(keyframe, T)
+        found = reproject(keyframe, T)
+        np.testing.assert_array_equal(found.visible, wanted.visible)
+        for name in ("uv", "warp", "J_w", "w"):
+            np.testing.assert_allclose(getattr(found, name)[4:], getattr(wanted, name)[4:], rtol=1e-9, atol=1e-9)
 
 
 def test_arrays_that_do_not_fit_are_refused() -> None:
@@ -136,15 +181,17 @@ def test_planes_are_met_as_defined() -> None:
     rng = np.random.default_rng(0)
     moved, points = rng.uniform((-2, -1.5, -0.5), (2, 1.5, 4), (900, 3)), rng.uniform((-2, -2, 1), (2, 2, 4), (300, 3))
     moved[:3], moved[3] = np.nan, 0.0
+    T = se3.exp(rng.normal(0, 0.1, 6))
+    source = se3.transform(se3.inverse(T), moved)
     grid = rng.integers(-1, 300, (12, 16))
-    partner = native().partners(intrinsics(SMALL), moved, grid, 16 / SMALL.width, 12 / SMALL.height)
-    np.testing.assert_array_equal(partner, shape_reference.partners(SMALL, moved, grid))
+    partner = native().partners(intrinsics(SMALL), T, source, grid, 16 / SMALL.width, 12 / SMALL.height)
+    np.testing.assert_array_equal(partner, shape_reference.partners(SMALL, T, source, grid))
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     normals[::7] = np.nan
     sigma = rng.uniform(0.001, 0.1, 900)
     sigma[::11] = 0.0
     for reach, least in ((0.8, 0.03), (0.8, 1e3), (1e-9, 0.03)):
-        arguments = moved, sigma, partner, points, normals, reach, 2.0, least, 0.5
+        arguments = T, source, sigma, partner, points, normals, reach, 2.0, least, 0.5
         (H, g, *counts), wanted = native().plane_system(*arguments), shape_reference.plane_system(*arguments)
         used = counts[0]
         assert tuple(counts) == wanted[2:] and (used > 50 or reach < 1e-6)

@@ -4,12 +4,14 @@
 #include <cstdio>
 #include <cstdlib>
 #include <limits>
+#include <memory>
 #include <random>
 #include <vector>
 
 #include "align.hpp"
 #include "bundle.hpp"
 #include "pose.hpp"
+#include "reproject.hpp"
 #include "surface.hpp"
 
 namespace {
@@ -48,6 +50,23 @@ void align_patches(int width, int height, int side, size_t each) {
               warp.data(), {centre.data(), covariance.data(), gain.data(), residual.data(), explained.data()});
     for (size_t i = 0; i < count; ++i)
         expect(std::isfinite(centre[2 * i]) == std::isfinite(centre[2 * i + 1]), "a centre is found or not");
+    std::unique_ptr<bool[]> valid(new bool[count]);
+    std::vector<double> information(4 * count);
+    sf::judge(uv.data(), {centre.data(), covariance.data(), gain.data(), residual.data(), explained.data()}, count, width,
+              height, {1, 4, 0.5, 2, 40, 4, 0.05}, information.data(), valid.get());
+    for (size_t i = 0; i < count; ++i)
+        expect(!valid[i] || std::isfinite(centre[2 * i]), "what was not found is not believed");
+}
+
+void see_again(size_t count, size_t each) {
+    const std::vector<double> T = numbers(16, -1, 1, 20, each), uv = numbers(2 * count, 0, 60, 21, each),
+                              w = numbers(count, 0, 1, 22, each), slope = numbers(2 * count, -0.1, 0.1, 23, each);
+    std::vector<double> there(2 * count), warp(4 * count), J_w(2 * count), w_there(count);
+    std::unique_ptr<bool[]> visible(new bool[count]);
+    sf::reproject(kCamera, T.data(), {uv.data(), w.data(), slope.data(), count}, 61, 41, 0.2, 5,
+                  {there.data(), warp.data(), J_w.data(), w_there.data(), visible.get()});
+    for (size_t i = 0; i < count; ++i)
+        expect(!visible[i] || (there[2 * i] >= 0 && there[2 * i] < 61), "what is visible lies in the image");
 }
 
 void find_pose(size_t count, size_t each) {
@@ -86,10 +105,11 @@ void meet_planes(int step, size_t each) {
                               sigma = numbers(count, 0, 1, 19, each);
     std::vector<int64_t> grid(12 * 9), partner(count);
     for (size_t i = 0; i < grid.size(); ++i) grid[i] = static_cast<int64_t>(i * 3) - 1;  // some beyond the surface
-    sf::partners(moved.data(), count, {grid.data(), 9, 12, 0.2, 0.2, kCamera}, partner.data());
+    const double T[] = {1, 0, 0, 0.5, 0, 1, 0, -0.2, 0, 0, 1, 0.1, 0, 0, 0, 1};
+    sf::partners(T, moved.data(), count, {grid.data(), 9, 12, 0.2, 0.2, kCamera}, partner.data());
     sf::PlaneSystem system;
-    sf::plane_system(moved.data(), sigma.data(), partner.data(), count, {moved.data(), normals.data(), count}, 0.5, 2, 0.03,
-                     1, system);
+    sf::plane_system(T, moved.data(), sigma.data(), partner.data(), count, {moved.data(), normals.data(), count}, 0.5, 2,
+                     0.03, 1, system);
     expect(system.used >= 0 && system.used <= system.met, "no more points count than have a partner");
     expect(system.met <= static_cast<int64_t>(count), "no more points than there are");
 }
@@ -100,7 +120,7 @@ int main() {
     for (const size_t each : {0, 1, 3, 17}) {
         for (const int side : {3, 8, 11, 41})
             for (const int width : {1, 2, 61}) align_patches(width, width == 61 ? 47 : 3, side, each);
-        for (const size_t count : {0, 1, 50}) find_pose(count, each);
+        for (const size_t count : {0, 1, 50}) find_pose(count, each), see_again(count, each);
         for (const int n : {1, 4}) adjust_bundle(n, 13, each);
         for (const int step : {1, 8, 100}) meet_planes(step, each);
     }
