@@ -58,6 +58,7 @@ class KeyframeMap:
     Attributes:
         scale: METRIC: relative poses are rigid; ARBITRARY: the unit may drift along the way, and loops find it.
         stamps: of the keyframes, ns.
+        measured: whether they have depth.
         S: [N, 4, 4] similarities: from a keyframe's optical frame, in the unit it was published in, to the map.
     """
 
@@ -65,12 +66,12 @@ class KeyframeMap:
         self.scale = Scale.METRIC
         self.stamps: list[int] = []
         self.S: Float64 = np.zeros((0, 4, 4))
+        self.measured: list[bool] = []
         self.places: list[Place] = []
         self.edges: list[tuple[int, int, Float64, Float64, bool]] = []  # i, j, Z, sigma, closes a loop
         self._loops = loops
         self._index = Index()
         self._walked: list[float] = []  # length of the path up to each keyframe
-        self._measured: list[bool] = []  # whether it is known to have depth
         self._gap = np.zeros(7)  # variances of the way to keyframes that were dropped since the last one
         self._came: tuple[Float64, float] | None = None  # where the last one was, dropped or not, and the way to it
         self._parts: Iterator[None] = iter(())
@@ -93,7 +94,7 @@ class KeyframeMap:
         before, way = self._came or (T[:3, 3], 0.0)
         self._came = T[:3, 3], way + float(np.linalg.norm(T[:3, 3] - before))
         self._walked.append(self._came[1])
-        self._measured.append(keyframe.depth is not None)
+        self.measured.append(keyframe.depth is not None)
         if found is not None:
             self._tie(found.index, n, T, found.sigma, loop=True)
         elif n:
@@ -123,7 +124,7 @@ class KeyframeMap:
         turn = 2 * config.keyframe_flow * camera.width / camera.fx
         near = np.linalg.norm(moved[:, :3, 3], axis=1) < turn * float(np.median(cloud.points[:, 2]))
         near &= moved[:, 2, 2] > np.cos(min(turn, np.pi))
-        near &= np.array(self._measured) | (keyframe.depth is None)
+        near &= np.array(self.measured) | (keyframe.depth is None)
         return [(int(i), moved[i]) for i in np.flatnonzero(near)]
 
     @property
@@ -142,7 +143,7 @@ class KeyframeMap:
         self.complete()
         _, _, _, sigma, _ = self.edges.pop()
         self._gap = np.asarray(sigma**2)
-        for values in (self.stamps, self.places, self._walked, self._measured):
+        for values in (self.stamps, self.places, self._walked, self.measured):
             values.pop()
         self.S = self.S[:-1]
         self._index.drop()
@@ -234,13 +235,20 @@ class KeyframeMap:
 
     def _verified(self, index: int, found: Features, camera: Camera, own: Place | None) -> list[Recognised]:
         """The view as the keyframes round ``index`` see it: one result or none."""
-        around = [i for i in (index - 1, index, index + 1) if 0 <= i < len(self.places)]
+        around = self._around(index)
         seen: Sighting | None = sight([self.places[i] for i in around], self.S[around], found, camera)
         unit = 1.0 if own is None or seen is None else seen.unit(own)
         if seen is None or unit is None:
             return []
         sigma = np.r_[seen.sigma, _LOOP_STRETCH]
         return [Recognised(index, sim3.similarity(seen.T, unit), sigma, seen.inliers)]
+
+    def _around(self, index: int) -> list[int]:
+        return [i for i in (index - 1, index, index + 1) if 0 <= i < len(self.places)]
+
+    def points_near(self, index: int) -> list[Float64]:
+        """Points [K, 3] in the map of keyframe number ``index`` and its neighbours."""
+        return [se3.transform(self.S[i], self.places[i].points.astype(np.float64)) for i in self._around(index)]
 
     def _unambiguous(self, found: list[Recognised]) -> Recognised | None:
         """The best of some results, unless another contradicts it: then two places look alike."""
@@ -286,12 +294,18 @@ class KeyframeMap:
         i, j, Z, sigma, loop = (list(part) for part in zip(*self.edges, strict=True))
         return Edges(np.array(i), np.array(j), np.array(Z), np.array(sigma), np.array(loop, dtype=bool))
 
-    def restore(self, stamps: list[int], S: Float64, places: list[Place], edges: list[tuple]) -> None:  # type: ignore[type-arg]
+    def restore(
+        self,
+        stamps: list[int],
+        S: Float64,
+        measured: list[bool],
+        places: list[Place],
+        edges: list[tuple[int, int, Float64, Float64, bool]],
+    ) -> None:
         """Take over the content of a map that was saved."""
-        self.stamps, self.S, self.places, self.edges = stamps, S, places, edges
+        self.stamps, self.S, self.measured, self.places, self.edges = stamps, S, measured, places, edges
         steps = np.linalg.norm(np.diff(S[:, :3, 3], axis=0), axis=1)
         self._walked = np.r_[0.0, np.cumsum(steps)].tolist() if len(stamps) else []
-        self._measured = [False] * len(stamps)  # not known any more; at worst a place gets another keyframe
         self._came = (S[-1, :3, 3], self._walked[-1]) if len(stamps) else None
         for place in places:
             self._index.add(place.descriptors)

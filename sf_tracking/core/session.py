@@ -25,6 +25,7 @@ from sf_tracking.core.beside import beside
 from sf_tracking.core.keyframe_map import KeyframeMap, Recognised
 from sf_tracking.core.places import Features, Place, features, place_of_frame, place_of_keyframe
 from sf_tracking.core.recognise import Sighting, sight
+from sf_tracking.core.shape import fit_points
 from sf_tracking.core.tracker import Tracker, TrackingState, TrackingUpdate
 
 _VIEWS = 8  # of the last seconds, to find the map by where its newest keyframes are not final yet
@@ -210,7 +211,12 @@ class TrackingSession:
             seen = features(frame.image)
             recognised, near = self._map.recognise(seen, frame.camera), self._among_views(seen, frame.camera)
             if near is not None and (recognised is None or near.inliers >= recognised.inliers):
-                return near.T @ back, None
+                points = [se3.transform(T, place.points) for place, T in self._known_views()]
+                return self._aligned(frame, near.T, near.sigma, points) @ back, None
+            if recognised is not None:
+                points = self._map.points_near(recognised.index)
+                S = self._aligned(frame, recognised.S, recognised.sigma[:6], points)
+                recognised = replace(recognised, S=S)
             depth = 0.0 if recognised is None else self._map.places[recognised.index].depth
         else:
             keyframe = self._tracker.known_keyframe()
@@ -227,6 +233,12 @@ class TrackingSession:
         if self._near or (hint is not None and self._map.agree(hint[0] @ se3.inverse(back), recognised.S, depth)):
             return start, recognised
         return None
+
+    def _aligned(self, frame: Frame, T: Float64, sigma: Float64, points: list[Float64]) -> Float64:
+        """T_map_camera of corners, which are few and repeat, made better by the frame's depth and points of the map."""
+        prior = np.diag(sigma**-2.0)
+        found = fit_points(frame, np.concatenate(points), se3.inverse(T), prior, self._config)
+        return T if found is None else se3.inverse(found.T)
 
     def _among_views(self, seen: Features, camera: Camera) -> Sighting | None:
         """An image that shows what was seen in the last seconds."""

@@ -7,7 +7,7 @@ compiled; :mod:`.shape_reference` is the same in numpy.
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +100,26 @@ def _gridded(camera: Camera, z: Float32, sigma: float) -> Shape:
     index = np.where(good, np.cumsum(good).reshape(h, w) - 1, -1)
     points = vertices[good]
     return Shape(points, normal[good], index, None, sigma * points[:, 2] ** 2, _LEAST, _INDEPENDENT)
+
+
+def fit_points(frame: Frame, points: Float64, T: Float64, prior: Float64, config: TrackingConfig) -> ShapeFit | None:
+    """Pose T_cw of a frame with depth near ``T`` by points [K, 3] of the map it may see; None where that tells none.
+
+    Args:
+        prior: [6, 6] information of ``T``, for exp(xi) T.
+    """
+    shape = shape_of(frame, config)
+    if shape is None or frame.camera is None:
+        return None
+    seen = se3.transform(T, points)
+    uv, z = frame.camera.project(seen)
+    with np.errstate(invalid="ignore"):
+        inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < (frame.camera.width, frame.camera.height)).all(axis=1)
+    seen, z = seen[inside], z[inside]
+    sigma = config.depth_sigma * z**2 if frame.depth is not None else np.full(len(z), config.lidar_sigma)
+    source = Shape(seen, np.full_like(seen, np.nan), None, None, sigma, shape.least, independent=1.0)
+    found = fit(frame.camera, source, shape, np.eye(4), prior, config.shape_trust) if len(seen) else None
+    return None if found is None else replace(found, T=found.T @ T)
 
 
 def _partners(camera: Camera, source: Shape, target: Shape, T: Float64) -> NDArray[np.int64]:

@@ -15,7 +15,7 @@ from sf_interfaces.types import Camera, Float64, Scale, Trajectory
 from sf_tracking.core.keyframe_map import KeyframeMap
 from sf_tracking.core.places import Place
 
-_VERSION = 2
+_VERSION = 3
 View = tuple[Place, Float64]  # with its T_map_camera
 
 
@@ -30,6 +30,7 @@ def write(path: Path, keyframes: KeyframeMap, trajectory: Trajectory, views: Seq
         "poses": trajectory.poses,
         "keyframe_stamps": np.array(keyframes.stamps, np.int64),
         "keyframes": keyframes.S,
+        "keyframes_measured": np.array(keyframes.measured, bool),
         "edge_ends": np.array([(i, j, loop) for i, j, _, _, loop in edges], np.int64).reshape(-1, 3),
         "edge_motions": np.array([Z for _, _, Z, _, _ in edges]).reshape(-1, 4, 4),
         "edge_sigmas": np.array([sigma for _, _, _, sigma, _ in edges]).reshape(-1, 7),
@@ -57,7 +58,8 @@ def read(path: Path, keyframes: KeyframeMap) -> tuple[dict[int, Float64], list[V
             for (i, j, loop), Z, sigma in zip(ends, a["edge_motions"], a["edge_sigmas"], strict=True)
         ]
         keyframes.scale = Scale.METRIC if a["metric"] else Scale.ARBITRARY
-        keyframes.restore(a["keyframe_stamps"].tolist(), a["keyframes"], _unpacked("place", a), edges)
+        measured = a["keyframes_measured"].tolist()
+        keyframes.restore(a["keyframe_stamps"].tolist(), a["keyframes"], measured, _unpacked("place", a), edges)
         views = list(zip(_unpacked("view", a), a["view_poses"], strict=True))
         return dict(zip(a["stamps"].tolist(), a["poses"], strict=True)), views
     except (OSError, ValueError, KeyError, TypeError, EOFError, IndexError, zipfile.BadZipFile) as error:

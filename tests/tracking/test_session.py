@@ -68,6 +68,24 @@ def test_a_restored_session_finds_its_place_and_keeps_the_trajectory(
     assert set(first.keyframe_trajectory().stamps_ns) <= set(second.keyframe_trajectory().stamps_ns)
 
 
+def test_a_restored_session_knows_what_it_has_seen(walk: tuple[list[Frame], list[np.ndarray]], tmp_path: Path) -> None:
+    """It finds its place to millimetres, so that what it sees again is known and makes no keyframes."""
+    config = TrackingConfig(window=3, keyframe_flow=0.004)
+    first = TrackingSession(config)
+    for frame in walk[0]:
+        first.track(frame)
+    first.save(tmp_path / "tracking.npz")
+    second = TrackingSession.restore(config, tmp_path / "tracking.npz")
+    known = len(second.keyframe_trajectory())
+    published = 0
+    for k in range(40):  # back and forth where the keyframes are final
+        i = [*range(6, 0, -1), *range(6)][k % 12]
+        update = second.track(replace(walk[0][i], stamp_ns=walk[0][-1].stamp_ns + (k + 1) * 50_000_000))
+        published += len(update.keyframes)
+        assert k < 3 or error(update.T_map_camera, walk[1][i]) < 0.01
+    assert known >= 4 and published <= 2
+
+
 def test_a_view_of_another_place_is_not_joined_to_the_map(
     walk: tuple[list[Frame], list[np.ndarray]], tmp_path: Path
 ) -> None:
