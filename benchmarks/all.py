@@ -34,7 +34,7 @@ FOLDER = {
         ["--lost", "--memory", "10000"],
     ),
     "scales": ([], ["--frames", "400", "--factor", "1"]),
-    "real": ([], ["--frames", "1000"]),
+    "real": ([], ["--frames", "1000", "--full"]),
 }
 # Those that write one file, by --out FILE.
 FILE = {

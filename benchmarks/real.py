@@ -2,34 +2,41 @@
 
     python benchmarks/real.py --data FOLDER [--frames 40] [--out bench]
 
-Besides recordings, trajectories of other systems (``trajectories_evo``) are measured against their ground truth, a
-textured Gazebo world (``mesh_small_house``) is rendered as RGB-D and RGB-L, and COLMAP, where installed, gets the
-photo set with ground-truth cameras.
+From 7-Scenes every fifth frame (``--full``: every one, too) also goes to other programs, and a flight through its map
+is drawn for the report. Besides recordings, trajectories of other systems (``trajectories_evo``) are measured against
+their ground truth, a textured Gazebo world (``mesh_small_house``) is rendered as RGB-D and RGB-L, and COLMAP, where
+installed, gets the photo set with ground-truth cameras.
 """
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import Benchmark, print_rows, run_line, simulated
-from peers import PHOTO_SETS, PeerMissing, load
+import open3d as o3d
+from common import Benchmark, load_frames, print_rows, run_line, simulated
+from peers import ODOMETRY, PHOTO_SETS, PeerMissing, load
+from speed import OurTracker, measure_tracker, provide_vocabulary, side_by_side
 
 from sf_bringup import measures
+from sf_bringup.bench_report import FLIGHT
 from sf_bringup.eval_files import read_trajectory
 from sf_bringup.evaluation import align_trajectories, trajectory_error
+from sf_bringup.flythrough import fly
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.simulate import SimulationSpec
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.io import datasets
 from sf_interfaces.io.datasets import ReadOptions
-from sf_interfaces.types import Scale, Trajectory
+from sf_interfaces.types import Frame, Scale, Trajectory
 
 # Recording -> goal; what else lies in the folder is tried with the goal that suits it.
-GOALS = {"rgbd_7scenes_redkitchen_000_199": "recon", "rgbl_kitti_odometry04_000_017": "recon"}
+KITCHEN = "rgbd_7scenes_redkitchen_000_199"
+GOALS = {KITCHEN: "recon", "rgbl_kitti_odometry04_000_017": "recon"}
+FRAMES = {KITCHEN: 200}  # at least
 TRAJECTORIES = (
     ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam.txt", "se3"),
     ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam_drift.txt", "se3"),
@@ -123,6 +130,16 @@ def _strecha(folder: Path, name: str) -> np.ndarray:
     return T
 
 
+def beside_peers(frames: list[Frame], strides: Sequence[int]) -> dict[str, list[dict[str, Any]]]:
+    """Tracking of the same RGB-D frames by this project and by other programs."""
+    tables = {}
+    for stride in strides:
+        some = frames[::stride]
+        rows = side_by_side(OurTracker, ODOMETRY, some, lambda make, some=some: measure_tracker(make, some))
+        tables[f"7-Scenes beside other programs, {len(some)} frames, every {stride}. one"] = rows
+    return tables
+
+
 def small_house(world: Path, frames: int, out: Path) -> list[tuple[str, Path]]:
     """The Gazebo world rendered twice, exact ground truth included."""
     size = {"frames": frames, "fps": 10.0, "width": 320, "height": 240, "focal": 240.0}
@@ -136,8 +153,12 @@ def main() -> None:
     bench = Benchmark("real", __doc__.splitlines()[0])
     bench.parser.add_argument("--data", type=Path, required=True, help="folder that holds the recordings")
     bench.parser.add_argument("--frames", type=int, default=30, help="of each recording, from its start")
+    bench.parser.add_argument("--full", action="store_true", help="also other programs on every frame of 7-Scenes")
     args = bench.parse()
-    bench.note(f"The first {args.frames} frames of each recording.")
+    bench.note(
+        f"The first {args.frames} frames of each recording, 200 of 7-Scenes, whose camera hardly moves at first."
+    )
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     inputs = [(folder.name, folder) for folder in recordings(args.data)]
     world = args.data / "mesh_small_house" / "worlds" / "small_house.world"
     if world.is_file():
@@ -146,12 +167,17 @@ def main() -> None:
     for name, source in inputs:
         out = args.out / "real" / name.replace(", ", "-").replace(" ", "_")
         try:
-            cells = score(run_line(source, out, GOALS.get(name, "auto"), reading=ReadOptions(limit=args.frames)))
+            limit = max(args.frames, FRAMES.get(name, 0))
+            cells = score(run_line(source, out, GOALS.get(name, "auto"), reading=ReadOptions(limit=limit)))
         except SceneFactoryError as error:
             cells = {"remark": str(error)}
         rows.append({"recording": name, **cells})
         print_rows(rows[-1:])
     tables: dict[str, list[dict[str, Any]]] = {"recordings": rows}
+    if (kitchen := args.out / "real" / KITCHEN / "input.mcap").is_file():
+        fly(kitchen.parent, 60, kitchen.with_name(FLIGHT))
+        provide_vocabulary(bench, args.out)
+        tables |= beside_peers(load_frames(kitchen), (5, 1) if args.full else (5,))
     if (args.data / "trajectories_evo").is_dir():
         tables["trajectories of other systems, as evo measures them"] = other_systems(args.data / "trajectories_evo")
     if (args.data / "mvs_strecha_fountain_P11").is_dir():

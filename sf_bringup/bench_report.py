@@ -14,6 +14,7 @@ from sf_bringup.run_folder import RunFolder
 from sf_bringup.summary import run_figures
 from sf_interfaces.errors import FormatError
 
+FLIGHT = "flight.webp"  # in the folder of a run
 _FACTS = ("machine", "versions", "models", "command", "seconds")
 
 
@@ -40,6 +41,8 @@ def write_bench_page(folder: Path) -> Path:
         if made:
             page.section(str(run.relative_to(folder)))
             add_figures(page, made)
+            if (run / FLIGHT).is_file():
+                page.image("flight through the map, no frame of it a view that was given", run / FLIGHT)
             figures.close(made)
     page.write(folder / "report.html")
     return folder / "report.html"

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation, RotationSpline
@@ -26,7 +27,8 @@ def fly(run_path: Path, frames: int, out: Path) -> int:
     """Draw ``frames`` views along the smoothed way of the keyframes.
 
     Args:
-        out: a name ending in .mp4 (MPEG-4, 25 frames a second), or a folder for ``00000.png`` and so on.
+        out: a name ending in .mp4 (MPEG-4, 25 frames a second) or .webp (moving, what a browser shows anywhere), or a
+            folder for ``00000.png`` and so on.
 
     Returns:
         The number of frames written.
@@ -37,14 +39,18 @@ def fly(run_path: Path, frames: int, out: Path) -> int:
     """
     if frames < 2:
         raise ConfigError(f"a flight needs at least two frames, got --fly {frames}")
-    if out.suffix not in ("", ".mp4"):
-        raise ConfigError(f"{out} is neither a .mp4 file nor a folder; choose --out flight.mp4 or --out FOLDER")
+    if out.suffix not in ("", ".mp4", ".webp"):
+        raise ConfigError(f"{out} is no .mp4, .webp or folder; choose --out flight.mp4, flight.webp or FOLDER")
     run = RunFolder.open(run_path)
     field, camera = open_map(run), run.camera()
     way = smooth_way(np.array(list(field.poses.values())), frames)
     drawn = (field.render(camera, T).image for T in way)
     if out.suffix == ".mp4":
         _write_video(drawn, out, (camera.width, camera.height))
+    elif out.suffix == ".webp":
+        first, *rest = (Image.fromarray(image) for image in drawn)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        first.save(out, save_all=True, append_images=rest, duration=round(1e3 / FPS), loop=0, quality=70)
     else:
         out.mkdir(parents=True, exist_ok=True)
         for index, image in enumerate(drawn):

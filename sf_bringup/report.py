@@ -57,6 +57,11 @@ class Page:
         """A figure under its name."""
         self._parts.append(f'<h3>{html.escape(name)}</h3><img src="data:image/webp;base64,{_embed(figure)}">')
 
+    def image(self, name: str, path: Path) -> None:
+        """A WebP file, still or moving, under its name."""
+        data = base64.b64encode(path.read_bytes()).decode()
+        self._parts.append(f'<h3>{html.escape(name)}</h3><img src="data:image/webp;base64,{data}">')
+
     def details(self, name: str, value: Any) -> None:
         """Text or values that open on a click."""
         words = value if isinstance(value, str) else json.dumps(value, indent=2, default=str)
