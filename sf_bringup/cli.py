@@ -306,7 +306,7 @@ def build_parser() -> argparse.ArgumentParser:
     way = p.add_mutually_exclusive_group(required=True)
     way.add_argument("--poses", type=Path, help="T_map_camera in TUM format")
     way.add_argument("--fly", type=int, metavar="N", help="N frames along the smoothed way of the keyframes")
-    p.add_argument("--out", type=Path, required=True, help="folder of images; with --fly also a .mp4 file")
+    p.add_argument("--out", type=Path, required=True, help="folder of images; with --fly also a .mp4 or .webp file")
     _add_view(verb("view", _view, "serve a page that shows the map of a finished run"))
 
     p = verb("export", _export, "write the results of a run in other formats; without a format: all it has")

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from sf_bringup.evaluation.depth import sparsification
 from sf_bringup.evaluation.trajectory import AlignedTrajectories
-from sf_interfaces.types import DepthMap, Float64, UInt8
+from sf_interfaces.types import DepthMap, Float32, Float64, UInt8
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +112,28 @@ def trajectory_figure(pair: AlignedTrajectories) -> Figure:
     error.set_ylabel("position error / cm")
     error.set_title("error over time")
     error.grid(alpha=0.3)
+    return figure
+
+
+def landmarks_figure(landmarks: Float32, frames: Float64, keyframes: Float64) -> Figure:
+    """Landmarks [N, 3] of a map with the way of the camera [M, 3] and its keyframes [K, 3], along both wider axes."""
+    figure, axes = plt.subplots(1, 2, figsize=(13, 6), constrained_layout=True)
+    some = landmarks[:: max(1, len(landmarks) // 20_000)]
+    low, high = np.percentile(some, (1, 99), axis=0) if len(some) else (keyframes.min(axis=0), keyframes.max(axis=0))
+    first, second, third = np.argsort(low - high)
+    for axis, a, b in zip(axes, (first, first), (second, third), strict=True):
+        axis.scatter(some[:, a], some[:, b], s=0.4, c="0.4", linewidths=0, label="landmarks", rasterized=True)
+        axis.plot(frames[:, a], frames[:, b], "C0", lw=1.5, label="frames")
+        axis.plot(keyframes[:, a], keyframes[:, b], "C3.", ms=4, label="keyframes")
+        margin = 0.1 * (high - low) + 0.1
+        every = np.concatenate([frames, keyframes, low[None] - margin, high[None] + margin])
+        axis.set_xlim(every[:, a].min(), every[:, a].max())
+        axis.set_ylim(every[:, b].min(), every[:, b].max())
+        axis.set_aspect("equal")
+        axis.set_xlabel(f"{'xyz'[a]}")
+        axis.set_ylabel(f"{'xyz'[b]}")
+        axis.grid(alpha=0.3)
+    axes[0].legend(loc="best", markerscale=4)
     return figure
 
 

@@ -14,10 +14,12 @@ import yaml
 
 from sf_interfaces import topics
 from sf_interfaces.errors import FormatError
+from sf_interfaces.geometry import se3
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.trajectory import read_tum
+from sf_interfaces.ros.clouds import decode_cloud
 from sf_interfaces.ros.messages import decode_camera_info, decode_depth, decode_pose, decode_variance, to_ns
-from sf_interfaces.types import Camera, DepthMap, Scale, Trajectory
+from sf_interfaces.types import Camera, DepthMap, Float32, Scale, Trajectory
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +104,23 @@ class RunFolder:
         if not pairs:
             raise FormatError(f"{self.path} has no keyframe poses: this run estimated none and was given none")
         return Trajectory.from_pairs(pairs, self.scale)
+
+    def landmarks(self) -> Float32:
+        """Landmarks of all keyframes in the map, [N, 3] m, as their keyframes were sent.
+
+        Raises:
+            FormatError: the line of this run had no tracker.
+        """
+        found = [np.zeros((0, 3), np.float32)]
+        poses = dict(zip((k := self.keyframe_poses()).stamps_ns.tolist(), k.poses, strict=True))
+        with BagReader(self.result) as reader:
+            if topics.KEYFRAME_LANDMARKS.name not in reader.topics:
+                raise FormatError(f"{self.path} has no landmarks: this run estimated no poses")
+            for raw in reader.messages([topics.KEYFRAME_LANDMARKS.name]):
+                cloud = decode_cloud(reader.decode(raw))
+                if (T := poses.get(cloud.stamp_ns)) is not None:
+                    found.append(se3.transform(T, cloud.points).astype(np.float32))
+        return np.concatenate(found)
 
     def depth_maps(self) -> Iterator[tuple[int, DepthMap]]:
         """Depth with variance of each keyframe, by stamp."""

@@ -175,6 +175,10 @@ def run_figures(run: RunFolder) -> dict[str, Figure]:
         out["overview"] = figures.overview(sample, *_ways(run, pair))
     if isinstance(pair, AlignedTrajectories):
         out["trajectory"] = figures.trajectory_figure(pair)
+    landmarks = _or_reason(run.landmarks)
+    if not isinstance(landmarks, str) and len(landmarks):
+        ways = run.trajectory().positions, run.keyframes().positions
+        out["trajectory and landmarks"] = figures.landmarks_figure(landmarks, *ways)
     if views:
         chosen = sorted({0, len(views) // 2, len(views) - 1})
         out["views that were not used"] = figures.views_figure([(views[k].rendered, views[k].real) for k in chosen])

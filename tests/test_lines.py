@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from mcap_ros2.reader import read_ros2_messages
+from PIL import Image
 from rosbags.highlevel import AnyReader
 
 from sf_bringup import cli
@@ -131,12 +132,16 @@ def test_finished_runs_are_exported_rendered_and_measured(
     assert len(np.loadtxt(tmp_path / "x" / "trajectory.kitti")) == SMALL["frames"]
     assert cli.main(["render", str(out), "--poses", str(out / "keyframes.tum"), "--out", str(tmp_path / "v")]) == 0
     assert list((tmp_path / "v").glob("*.depth.png"))
-    assert "views that were not used" in (out / "report.html").read_text()
+    report = (out / "report.html").read_text()
+    assert "views that were not used" in report and "trajectory and landmarks" in report
     assert cli.main(["render", str(out), "--fly", "7", "--out", str(tmp_path / "flight.mp4")]) == 0
     video = cv2.VideoCapture(str(tmp_path / "flight.mp4"))
     frames = [video.read()[1] for _ in range(7)]
     assert not video.read()[0] and all(f.shape == frames[0].shape for f in frames)
     assert np.abs(frames[0].astype(int) - frames[6]).mean() > 2 and frames[3].std() > 10
+    assert cli.main(["render", str(out), "--fly", "3", "--out", str(tmp_path / "flight.webp")]) == 0
+    with Image.open(tmp_path / "flight.webp") as moving:
+        assert moving.n_frames == 3 and (moving.height, moving.width) == frames[0].shape[:2]
     capsys.readouterr()
     assert cli.main(["eval", "traj", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rmse"] < 0.02
