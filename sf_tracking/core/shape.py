@@ -19,7 +19,7 @@ from sf_tracking.config import TrackingConfig
 from sf_tracking.core.native import intrinsics, native
 
 _COLUMNS = 80  # of the grid on which dense depth is compared
-_EDGE = 0.05  # relative step of depth between cells, beyond which they belong to different surfaces
+_UNUSUAL, _ROUGH = 4.0, 0.002  # times the usual deviation from a plane, plus so much of the depth: still one surface
 _NEIGHBOURS = 8  # sparse points that define a surface normal
 _FLAT = 0.1  # residual of that plane relative to its extent
 _POINTS = 1500  # sparse points compared at most
@@ -83,20 +83,37 @@ def _scattered(points: Float64, sigma: float) -> Shape:
     return Shape(points, normals, None, tree, np.full(len(points), sigma), least=1.0, independent=1.0)
 
 
+def _smooth(rough: Float64, depth: Float64, known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which of the ``known`` cells are as smooth as most: what lies across a border of two surfaces lies on neither.
+
+    A sensor's noise grows with its depth (structured light); how much, most cells tell.
+    """
+    if not known.any():
+        return known
+    usual = float(np.median(rough[known] / depth[known]))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(known & (rough < _UNUSUAL * usual * depth + _ROUGH))
+
+
 def _gridded(camera: Camera, z: Float32, sigma: float) -> Shape:
     step = max(1, round(camera.width / _COLUMNS))
-    known, mean, extent = native().thin(np.ascontiguousarray(z, np.float32), step)
-    h, w = mean.shape
-    good = (known > 0.6 * step * step) & (extent < _EDGE * step / 4 * mean)
+    known, centre, rough = native().thin(np.ascontiguousarray(z, np.float32), step)
+    h, w = centre.shape
+    good = _smooth(rough, centre, (known > 0.6 * step * step) & (centre > 0))
     v, u = (np.mgrid[0:h, 0:w] + 0.5) * step
-    vertices = camera.unproject(np.stack([u, v], axis=-1), np.where(good, mean, np.nan))  # [h, w, 3]
+    vertices = camera.unproject(np.stack([u, v], axis=-1), np.where(good, centre, np.nan))  # [h, w, 3]
     across, down = np.full_like(vertices, np.nan), np.full_like(vertices, np.nan)
     across[:, 1:-1], down[1:-1] = vertices[:, 2:] - vertices[:, :-2], vertices[2:] - vertices[:-2]
     normal = np.cross(across, down)
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-        smooth = (np.abs(across[..., 2]) < 2 * _EDGE * mean) & (np.abs(down[..., 2]) < 2 * _EDGE * mean)
-    normal[~smooth] = np.nan
+        inverse = np.where(good, 1.0 / centre, np.nan)
+        bend = np.full((h, w), np.nan)  # of the surface round a cell, relative to its depth
+        bend[1:-1, 1:-1] = np.maximum(
+            np.abs(inverse[1:-1, 2:] + inverse[1:-1, :-2] - 2 * inverse[1:-1, 1:-1]),
+            np.abs(inverse[2:, 1:-1] + inverse[:-2, 1:-1] - 2 * inverse[1:-1, 1:-1]),
+        ) * centre[1:-1, 1:-1]  # fmt: skip
+    normal[~_smooth(bend, centre, np.isfinite(bend))] = np.nan
     index = np.where(good, np.cumsum(good).reshape(h, w) - 1, -1)
     points = vertices[good]
     return Shape(points, normal[good], index, None, sigma * points[:, 2] ** 2, _LEAST, _INDEPENDENT)

@@ -12,18 +12,27 @@ from sf_tracking.core.bundle_reference import robust
 
 
 def thin(z: Float32, step: int) -> tuple[NDArray[np.int64], Float64, Float64]:
-    """How many pixels of each block of ``step`` are known, their mean depth, and the difference of their extremes.
+    """Planes through the inverse depths of each block of ``step``.
+
+    How many pixels are known, depth in the middle, and the deviation from the plane relative to it; 0 without any.
 
     Args:
         z: [H, W] m; NaN, infinite or not positive: unknown.
     """
     h, w = z.shape[0] // step, z.shape[1] // step
-    block = z[: h * step, : w * step].reshape(h, step, w, step).astype(np.float64)
+    block = z[: h * step, : w * step].reshape(h, step, w, step).transpose(0, 2, 1, 3).reshape(h, w, step * step)
     known = (block > 0) & np.isfinite(block)
-    count = known.sum(axis=(1, 3))
-    mean = np.where(known, block, 0.0).sum(axis=(1, 3)) / np.maximum(count, 1)
-    low, high = np.where(known, block, np.inf).min(axis=(1, 3)), np.where(known, block, 0.0).max(axis=(1, 3))
-    return count, mean, np.where(count > 0, high - np.where(count > 0, low, 0.0), 0.0)
+    W = np.where(known, 1.0 / np.where(known, block, 1.0).astype(np.float64), 0.0)
+    v, u = ((g - (step - 1) / 2).ravel() for g in np.mgrid[0:step, 0:step])
+    A = np.stack([np.ones(step * step), u, v], axis=-1) * known[..., None]  # [h, w, step^2, 3]
+    At = A.swapaxes(-1, -2)
+    plane = np.linalg.solve(At @ A + 1e-9 * np.eye(3), At @ W[..., None])
+    left = np.where(known, W - (A @ plane)[..., 0], 0.0)
+    count, middle = known.sum(axis=-1), plane[..., 0, 0]
+    good = (count > 0) & (middle > 0)
+    middle = np.where(good, middle, 1.0)
+    deviation = np.sqrt((left**2).sum(axis=-1) / np.maximum(count, 1)) / middle
+    return count, np.where(good, 1.0 / middle, 0.0), np.where(good, deviation, 0.0)
 
 
 def partners(camera: Camera, T: Float64, source: Float64, grid: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -137,12 +137,12 @@ nb::tuple thin(In<float, -1, -1> z, int step) {
     require(step >= 1 && z.shape(0) < 32768 && z.shape(1) < 32768, "step must be at least 1, the image below 32768");
     const size_t rows = z.shape(0) / step, cols = z.shape(1) / step;
     Made<int32_t> known({rows, cols});
-    Made<double> mean({rows, cols}), extent({rows, cols});
+    Made<double> centre({rows, cols}), rough({rows, cols});
     alone([&] {
-        sf::thin(z.data(), static_cast<int>(z.shape(0)), static_cast<int>(z.shape(1)), step, known.get(), mean.get(),
-                 extent.get());
+        sf::thin(z.data(), static_cast<int>(z.shape(0)), static_cast<int>(z.shape(1)), step, known.get(), centre.get(),
+                 rough.get());
     });
-    return nb::make_tuple(known.give(), mean.give(), extent.give());
+    return nb::make_tuple(known.give(), centre.give(), rough.give());
 }
 
 Out<int64_t> partners(In<double, 4> camera, In<double, 4, 4> T, In<double, -1, 3> points, In<int64_t, -1, -1> grid,

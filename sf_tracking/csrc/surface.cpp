@@ -10,27 +10,43 @@
 
 namespace sf {
 
-SF_SIMD void thin(const float* z, int height, int width, int step, int32_t* known, double* mean, double* extent) {
+constexpr double kRidge = 1e-9;  // keeps a plane through few pixels determined
+
+SF_SIMD void thin(const float* z, int height, int width, int step, int32_t* known, double* centre, double* rough) {
     const int rows = height / step, cols = width / step;
+    const double middle = 0.5 * (step - 1);
     for (int row = 0; row < rows; ++row)
         for (int col = 0; col < cols; ++col) {
             const float* block = z + static_cast<size_t>(row) * step * width + static_cast<size_t>(col) * step;
-            double sum = 0;
-            float low = std::numeric_limits<float>::infinity(), high = 0;
-            int32_t count = 0;
-            for (int i = 0; i < step; ++i)
+            // Sums of 1, u, v, uu, uv, vv, w, uw, vw, ww over the known pixels; w is inverse depth.
+            double n = 0, su = 0, sv = 0, suu = 0, suv = 0, svv = 0, sw = 0, suw = 0, svw = 0, sww = 0;
+            for (int i = 0; i < step; ++i) {
+                const double v = i - middle;
                 for (int j = 0; j < step; ++j) {
                     const float d = block[static_cast<size_t>(i) * width + j];
                     const bool good = d > 0.0f && d <= std::numeric_limits<float>::max();
-                    sum += good ? d : 0.0f;
-                    low = good && d < low ? d : low;
-                    high = good && d > high ? d : high;
-                    count += good;
+                    const double one = good ? 1.0 : 0.0, w = good ? 1.0 / static_cast<double>(d) : 0.0;
+                    const double u = one * (j - middle);
+                    n += one;
+                    su += u;
+                    sv += one * v;
+                    suu += u * u;
+                    suv += u * v;
+                    svv += one * v * v;
+                    sw += w;
+                    suw += u * w;
+                    svw += v * w;
+                    sww += w * w;
                 }
+            }
             const size_t cell = static_cast<size_t>(row) * cols + col;
-            known[cell] = count;
-            mean[cell] = count ? sum / count : 0.0;
-            extent[cell] = count ? double(high) - double(low) : 0.0;
+            known[cell] = static_cast<int32_t>(n);
+            centre[cell] = rough[cell] = 0.0;
+            const double A[9] = {n + kRidge, su, sv, su, suu + kRidge, suv, sv, suv, svv + kRidge}, b[3] = {sw, suw, svw};
+            double x[3];
+            if (n == 0 || !solve_spd<3>(A, b, x) || !(x[0] > 0)) continue;
+            centre[cell] = 1.0 / x[0];
+            rough[cell] = std::sqrt(std::max(sww - x[0] * b[0] - x[1] * b[1] - x[2] * b[2], 0.0) / n) / x[0];
         }
 }
 

@@ -8,9 +8,10 @@
 
 namespace sf {
 
-// Blocks of step x step of a depth image [height, width] (NaN or <= 0: none): how many pixels are known, their mean,
-// and the difference of their extremes. Out: [height / step, width / step] each; mean and extent are 0 without any.
-void thin(const float* z, int height, int width, int step, int32_t* known, double* mean, double* extent);
+// Planes through the inverse depths of blocks of step x step of a depth image [height, width] (NaN or <= 0: none): how
+// many pixels are known, depth in the middle of the block, and the deviation from the plane relative to it. Out:
+// [height / step, width / step] each; 0 without any.
+void thin(const float* z, int height, int width, int step, int32_t* known, double* centre, double* rough);
 
 struct Surface {
     const double* points;   // [K, 3] m

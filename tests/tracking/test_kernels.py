@@ -173,8 +173,23 @@ def test_depth_is_thinned_as_defined(step: int) -> None:
     z = rng.uniform(0.5, 5.0, (61, 80)).astype(np.float32)
     z[rng.random(z.shape) < 0.4] = np.nan
     z[:14, :14], z[20, 20], z[21, 30] = 0.0, np.inf, -1.0
-    for a, b in zip(native().thin(z, step), shape_reference.thin(z, step), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6)
+    (count, centre, rough), wanted = native().thin(z, step), shape_reference.thin(z, step)
+    np.testing.assert_array_equal(count, wanted[0])
+    enough = count > 0.5 * step * step  # fewer pixels may lie in a line, through which many planes go
+    np.testing.assert_allclose(centre[enough], wanted[1][enough], rtol=1e-6)
+    np.testing.assert_allclose(rough[enough], wanted[2][enough], rtol=1e-6, atol=1e-4)
+    assert np.isfinite(centre).all() and np.isfinite(rough).all() and (centre[count == 0] == 0).all()
+
+
+def test_a_plane_is_smooth_and_borders_are_not() -> None:
+    v, u = np.mgrid[0:120, 0:160] + 0.5
+    z = (1.0 / (0.4 + 0.001 * u - 0.0005 * v)).astype(np.float32)
+    _, centre, rough = native().thin(z, 8)
+    middle = np.mgrid[0:15, 0:20] * 8 + 4.0
+    np.testing.assert_allclose(centre, 1.0 / (0.4 + 0.001 * middle[1] - 0.0005 * middle[0]), rtol=1e-5)
+    assert rough.max() < 1e-5
+    z[:, 100:] += 0.1  # 10 cm behind
+    assert (native().thin(z, 8)[2][:, 12] > 0.01).all()
 
 
 def test_planes_are_met_as_defined() -> None:
