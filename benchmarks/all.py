@@ -28,6 +28,7 @@ FOLDER = {
     ),
     "depth": (["--line", "room0"], ["--all", "--oracle", "--line", *_ROOMS, "hall"]),
     "live_map": ([], []),
+    "colour": (["--methods", "ours", "tsdf", "warp"], []),
     "map_memory": (["--keyframes", "12"], ["--keyframes", "100"]),
     "loops": (
         ["--walks", "room-rgbd", "room-mono", "--factor", "0.25", "--lost"],
@@ -43,7 +44,7 @@ FILE = {
     "play_record": (["--frames", "90", "--rates", "1", "4"], []),
     "completion": ([], []),
 }
-NEED_DATA = ("real", "completion", "live_map")
+NEED_DATA = ("real", "completion", "live_map", "colour")
 USE_DATA = (*NEED_DATA, "depth")
 
 

@@ -174,14 +174,19 @@ def score(method: Method, held: list[Keyframe], others: list[np.ndarray] | None)
 def main() -> None:
     """Build, render, compare."""
     bench = Benchmark("colour", __doc__ or "")
-    bench.parser.add_argument("data", type=Path, help="folder of a 7-Scenes sequence, or a simulated bag")
+    bench.parser.add_argument("recording", type=Path, nargs="?", help="a 7-Scenes sequence, or a simulated bag")
+    bench.parser.add_argument("--data", type=Path, help="in its place: a folder that holds such a sequence")
     bench.parser.add_argument("--mesh", type=Path, help="true surface of a simulated bag")
     bench.parser.add_argument("--frames", type=int, default=200)
     bench.parser.add_argument("--step", type=int, default=10)
     bench.parser.add_argument("--methods", nargs="+", default=["ours", "field", "tsdf", "warp"])
     bench.parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="of section recon")
     args = bench.parse()
-    keys, held = load(args.data, args.frames, args.step)
+    folders = sorted((args.data or Path()).iterdir())
+    recording = args.recording or next((folder for folder in folders if SevenScenes.matches(folder)), None)
+    if recording is None:
+        bench.parser.error(f"no 7-Scenes sequence in {args.data or Path()}; name one, or a simulated bag")
+    keys, held = load(recording, args.frames, args.step)
     given = dict(pair.split("=", 1) for pair in args.set)
     filled = [warp(keys)(frame)[1] for frame in held]
     rows = []
