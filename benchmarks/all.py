@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 # name -> arguments of the quick run, of the full run.
 _ROOMS = ["room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4"]
 FOLDER = {
-    "speed": ([], ["--frames", "300", "--stride", "1", "--factor", "1"]),
+    "speed": (["--factor", "1"], ["--frames", "300", "--stride", "1", "--factor", "1"]),
     "rooms": ([], ["--rooms", *_ROOMS, "--frames", "2000", "--stride", "1", "--factor", "1"]),
     "noise": ([], ["--rooms", *_ROOMS, "--frames", "300"]),
     "rooms_given": (

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 from common import Benchmark, load_frames, print_rows, run_line, simulated
-from peers import ODOMETRY, PHOTO_SETS, PeerMissing, load
+from peers import ODOMETRY, PHOTO_SETS, SWEEPS, PeerMissing, load
 from speed import OurTracker, measure_tracker, provide_vocabulary, side_by_side
 
 from sf_bringup import measures
@@ -26,16 +26,22 @@ from sf_bringup.bench_report import FLIGHT
 from sf_bringup.eval_files import read_trajectory
 from sf_bringup.evaluation import align_trajectories, trajectory_error
 from sf_bringup.flythrough import fly
+from sf_bringup.preflight import static_frames
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.simulate import SimulationSpec
 from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.geometry import se3
 from sf_interfaces.io import datasets
+from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.datasets import ReadOptions
-from sf_interfaces.types import Frame, Scale, Trajectory
+from sf_interfaces.io.datasets.dataset import LIDAR
+from sf_interfaces.ros.clouds import decode_cloud
+from sf_interfaces.types import Float64, Frame, Scale, Trajectory
 
 # Recording -> goal; what else lies in the folder is tried with the goal that suits it.
 KITCHEN = "rgbd_7scenes_redkitchen_000_199"
-GOALS = {KITCHEN: "recon", "rgbl_kitti_odometry04_000_017": "recon"}
+STREET = "rgbl_kitti_odometry04_000_017"
+GOALS = {KITCHEN: "recon", STREET: "recon"}
 FRAMES = {KITCHEN: 200}  # at least
 TRAJECTORIES = (
     ("freiburg1_xyz-groundtruth.txt", "freiburg1_xyz-rgbdslam.txt", "se3"),
@@ -140,6 +146,35 @@ def beside_peers(frames: list[Frame], strides: Sequence[int]) -> dict[str, list[
     return tables
 
 
+def street_end(run: RunFolder) -> list[dict[str, Any]]:
+    """How far the end of a street lies from where it should, seen from its beginning, beside LiDAR odometry."""
+    bag, truth, own = Path(run.info()["bag"]), measures.truth_of(run), run.trajectory()
+    poses = dict(zip(own.stamps_ns.tolist(), own.poses, strict=True))
+    rows = [_end_row("this project", [(stamp, poses[stamp]) for stamp in sorted(poses)], truth)]
+    made, missing = load(SWEEPS)
+    for name, make in made.items():
+        odometry, found = make(), []
+        with BagReader(bag) as reader:
+            mount = static_frames(reader).lookup(run.camera().frame_id, LIDAR)
+            sweeps = (decode_cloud(reader.decode(raw)) for raw in reader.messages(["/lidar/points"]))
+            for sweep in sweeps:
+                found.append((sweep.stamp_ns, mount @ odometry.track(sweep) @ se3.inverse(mount)))
+        rows.append(_end_row(name, found, truth))
+    return rows + [{"system": name, "remark": why} for name, why in missing.items()]
+
+
+def _end_row(system: str, poses: Sequence[tuple[int, Float64]], truth: Trajectory) -> dict[str, Any]:
+    """The error of the last pose [4, 4] seen from the first."""
+    true = dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
+    known = [(true[stamp], T) for stamp, T in poses if stamp in true]
+    (G0, E0), (G1, E1) = known[0], known[-1]
+    off = se3.inverse(se3.inverse(G0) @ G1) @ (se3.inverse(E0) @ E1)
+    way = float(np.linalg.norm(np.diff([G[:3, 3] for G, _ in known], axis=0), axis=1).sum())
+    error = float(np.linalg.norm(off[:3, 3]))
+    return {"system": system, "frames": len(known), "path m": way, "end off by cm": 100 * error,
+            "off by deg": float(np.degrees(np.linalg.norm(se3.log(off)[3:])))}  # fmt: skip
+
+
 def small_house(world: Path, frames: int, out: Path) -> list[tuple[str, Path]]:
     """The Gazebo world rendered twice, exact ground truth included."""
     size = {"frames": frames, "fps": 10.0, "width": 320, "height": 240, "focal": 240.0}
@@ -178,6 +213,8 @@ def main() -> None:
         fly(kitchen.parent, 60, kitchen.with_name(FLIGHT))
         provide_vocabulary(bench, args.out)
         tables |= beside_peers(load_frames(kitchen), (5, 1) if args.full else (5,))
+    if (args.out / "real" / STREET / "run.json").is_file():
+        tables["the end of a street, LiDAR odometry beside it"] = street_end(RunFolder.open(args.out / "real" / STREET))
     if (args.data / "trajectories_evo").is_dir():
         tables["trajectories of other systems, as evo measures them"] = other_systems(args.data / "trajectories_evo")
     if (args.data / "mvs_strecha_fountain_P11").is_dir():

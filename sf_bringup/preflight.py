@@ -43,7 +43,8 @@ def _probe(reader: BagReader, topic: str) -> Probe | None:
     return discovery.probe(reader.decode(raw))
 
 
-def _static_frames(reader: BagReader) -> FrameTree:
+def static_frames(reader: BagReader) -> FrameTree:
+    """How the sensors are mounted, as /tf_static of a bag says."""
     tree = FrameTree()
     if "/tf_static" in reader.topics:
         for raw in reader.messages(["/tf_static"]):
@@ -78,7 +79,7 @@ def inspect(bag: Path, user: Mapping[str, str]) -> BagInput:
         count = reader.topics[leader].count if leader else 0
         seconds = (reader.end_ns - reader.start_ns) * 1e-9
         transforms = tuple(t for t in (topics.TF_STATIC.name, topics.TF.name) if t in reader.topics)
-        return BagInput(bag, mapping, frames, _static_frames(reader), transforms, seconds, count)
+        return BagInput(bag, mapping, frames, static_frames(reader), transforms, seconds, count)
 
 
 def check_extrinsic(given: BagInput) -> None:

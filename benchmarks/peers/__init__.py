@@ -15,9 +15,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from sf_bringup.evaluation import Samples
-from sf_interfaces.types import Camera, Float64, Frame, UInt8
+from sf_interfaces.types import Camera, Float64, Frame, PointCloud, UInt8
 
 ODOMETRY = ("open3d_odometry", "open3d_slam", "opencv_odometry", "small_gicp_map", "kiss_icp_map", "orbslam3")
+SWEEPS = ("kiss_icp_sweeps",)
 MAPPING = ("open3d_tsdf",)
 PHOTO_SETS = ("colmap",)
 
@@ -31,6 +32,13 @@ class Odometry(Protocol):
 
     def track(self, frame: Frame) -> Float64 | None:
         """T_first_camera [4, 4] of the frame, None when lost. Frames come in order of time."""
+
+
+class SweepOdometry(Protocol):
+    """Tracks a LiDAR."""
+
+    def track(self, sweep: PointCloud) -> Float64:
+        """T_first_lidar [4, 4] of the sweep. Sweeps come in order of time."""
 
 
 class Mapper(Protocol):
