@@ -175,9 +175,9 @@ class MultiViewDepth:
                     "scene; give views that are a tenth of the distance to the scene apart"
                 )
             good = Observations(seen.uv, seen.target, weight)
-            adjusted = dense_ba.adjust(good, at, poses=poses, intrinsics=intrinsics)
-            at = adjusted.estimate
-        return _Fit(adjusted, good)
+            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
+            at = found.estimate
+        return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
 
     def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
         """The fit with poses as given; None if they contradict the correspondences, or explain few of them."""
