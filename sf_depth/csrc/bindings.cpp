@@ -4,11 +4,13 @@
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 
+#include <algorithm>
 #include <initializer_list>
 #include <memory>
 #include <vector>
 
 #include "dense_ba.hpp"
+#include "plane_sweep.hpp"
 
 namespace nb = nanobind;
 
@@ -114,10 +116,41 @@ Out<double> substitute(In<float, -1, -1> E, In<float, -1> C, In<float, -1> w, In
     return dd.give();
 }
 
+Out<float> dissimilarity(In<float, -1, -1> first, In<float, -1, -1> mean, In<float, -1, -1> scale,
+                         In<float, -1, -1, -1> others, In<float, -1, 3, -1> rotated, In<float, -1, 3> t,
+                         In<float, 5> theta, In<float, 2> zoom, float least_z, float noise, float unseen, float d) {
+    const size_t h = first.shape(0), w = first.shape(1), count = others.shape(0);
+    const auto fits = [&](const auto& a, size_t at) { return a.shape(at) == h && a.shape(at + 1) == w; };
+    require(h > 1 && w > 1 && fits(mean, 0) && fits(scale, 0) && fits(others, 1), "the images differ in size");
+    require(count > 0 && rotated.shape(0) == count && rotated.shape(2) == h * w && t.shape(0) == count,
+            "one turned ray for each pixel of each source");
+    sf::Compared c{count, h, w, first.data(), mean.data(), scale.data(), others.data(), rotated.data(), t.data(),
+                   {}, {zoom(0), zoom(1)}, least_z, noise, unseen};
+    std::copy_n(theta.data(), 5, c.theta);
+    Made<float> cost({h, w});
+    {
+        nb::gil_scoped_release free;
+        sf::dissimilarity(c, d, cost.get());
+    }
+    return cost.give();
+}
+
+Out<float> best_paths(In<float, -1, -1, -1> cost, In<float, -1, -1> image, bool upright, float bend, float jump,
+                      float edge) {
+    const size_t h = cost.shape(0), w = cost.shape(1), planes = cost.shape(2);
+    require(image.shape(0) == h && image.shape(1) == w && planes > 0, "the image does not fit the cost");
+    Made<float> total({h, w, planes});
+    {
+        nb::gil_scoped_release free;
+        sf::best_paths({h, w, planes, cost.data(), image.data()}, upright, {bend, jump, edge}, total.get());
+    }
+    return total.give();
+}
+
 }  // namespace
 
 NB_MODULE(_native, m) {
-    m.doc() = "Compiled kernels of the depth block; dense_ba_reference.py of its core defines them.";
+    m.doc() = "Compiled kernels of the depth block; the *_reference.py files of its core define them.";
     m.def("squared_residuals", &squared_residuals, nb::arg("theta"), nb::arg("T"), nb::arg("x"), nb::arg("d"),
           nb::arg("target"), nb::arg("weight"));
     m.def("robust_cost", &robust_cost, nb::arg("squares"), nb::arg("weight"), nb::arg("c2"), nb::arg("blind"));
@@ -125,4 +158,9 @@ NB_MODULE(_native, m) {
           nb::arg("weight"), nb::arg("dx"), nb::arg("columns"), nb::arg("poses"), nb::arg("c2"), nb::arg("scores"));
     m.def("eliminate", &eliminate, nb::arg("E"), nb::arg("C"), nb::arg("w"), nb::arg("H"), nb::arg("g"));
     m.def("substitute", &substitute, nb::arg("E"), nb::arg("C"), nb::arg("w"), nb::arg("dx"));
+    m.def("dissimilarity", &dissimilarity, nb::arg("first"), nb::arg("mean"), nb::arg("scale"), nb::arg("others"),
+          nb::arg("rotated"), nb::arg("t"), nb::arg("theta"), nb::arg("zoom"), nb::arg("least_z"), nb::arg("noise"),
+          nb::arg("unseen"), nb::arg("d"));
+    m.def("best_paths", &best_paths, nb::arg("cost"), nb::arg("image"), nb::arg("upright"), nb::arg("bend"),
+          nb::arg("jump"), nb::arg("edge"));
 }
