@@ -56,7 +56,7 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
     everywhere = np.argwhere(measured)
     indices, trees, nears, spacings, first = [], [], [], [], []
     for cell in _CELLS:
-        index = np.argwhere(measured & gap) if cell == 1 else _thinned(everywhere, cell)
+        index = np.argwhere(measured & gap) if cell == 1 else _thinned(measured, cell)
         if indices and len(index) <= _NEIGHBOURS:
             break
         if indices and _SPARSER * len(index) > len(indices[-1]) and cell > 1:
@@ -82,14 +82,18 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
     return Observations(index, x, value, variance, slope, spacing, near, tuple(trees), tuple(first))
 
 
-def _thinned(index: np.ndarray, cell: int) -> np.ndarray:
-    """The observation nearest to the centre of each cell, [M, 2]."""
-    key = (index[:, 0] // cell) * (1 << 20) + index[:, 1] // cell
-    off = ((index % cell - 0.5 * (cell - 1)) ** 2).sum(axis=1)
-    order = np.lexsort((off, key))
-    keep = np.ones(len(order), dtype=bool)
-    keep[1:] = key[order][1:] != key[order][:-1]
-    return index[np.sort(order[keep])]
+def _thinned(measured: np.ndarray, cell: int) -> np.ndarray:
+    """The measured pixel nearest to the centre of each cell, [M, 2] in the order of the image."""
+    (height, width), side = measured.shape, np.arange(cell) - 0.5 * (cell - 1)
+    rows, cols = -(-height // cell), -(-width // cell)
+    padded = np.pad(measured, ((0, rows * cell - height), (0, cols * cell - width)))
+    inside = padded.reshape(rows, cell, cols, cell).swapaxes(1, 2).reshape(rows, cols, cell * cell)
+    off = (side[:, None] ** 2 + side**2).reshape(-1).astype(np.float32)
+    row, col = np.nonzero(inside.any(axis=2))
+    nearest = np.where(inside[row, col], off, np.float32(np.inf)).argmin(axis=1)
+    row, col = row * cell + nearest // cell, col * cell + nearest % cell
+    order = np.lexsort((col, row))
+    return np.stack([row[order], col[order]], axis=1)
 
 
 def _slopes(x: torch.Tensor, ratio: torch.Tensor, near: torch.Tensor, spacing: torch.Tensor) -> torch.Tensor:
