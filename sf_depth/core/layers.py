@@ -100,17 +100,16 @@ def reliability(observed: Observations, color: torch.Tensor) -> tuple[torch.Tens
     """
     ids = torch.cat([torch.arange(len(observed.ratio))[:, None], observed.near], dim=1)
 
-    def weigh(part: torch.Tensor) -> torch.Tensor:
-        seen = look(observed, part[:, 1:], observed.x[part[:, :1]], color)
-        around = _median(seen.value, seen.affinity / (seen.square + 1e-3))[:, 0]
-        behind = torch.log(around / observed.ratio[part[:, 0]]).clamp_min(0.0) / _SUSPECT
-        return 1.0 / (1.0 + behind * behind)
-
-    def settle(part: torch.Tensor) -> torch.Tensor:
+    def weigh(part: torch.Tensor) -> tuple[Neighbourhood, torch.Tensor]:
         seen = look(observed, part, observed.x[part[:, :1]], color)
-        trust = seen.affinity * weight[part][..., None]
-        return _smooth(seen, observed.ratio[part[:, :1]], trust, observed.spacing)[:, 0]
+        around = _median(seen.value[:, 1:], seen.affinity[:, 1:] / (seen.square[:, 1:] + 1e-3))[:, 0]
+        behind = torch.log(around / observed.ratio[part[:, 0]]).clamp_min(0.0) / _SUSPECT
+        return seen, 1.0 / (1.0 + behind * behind)
 
-    parts = ids.split(_CHUNK)
-    weight = torch.cat(each(weigh, parts))
-    return weight, torch.cat(each(settle, parts))
+    def settle(seen: Neighbourhood) -> torch.Tensor:
+        trust = seen.affinity * weight[seen.ids][..., None]
+        return _smooth(seen, observed.ratio[seen.ids[:, :1]], trust, observed.spacing)[:, 0]
+
+    looked, weights = zip(*each(weigh, ids.split(_CHUNK)), strict=True)
+    weight = torch.cat(weights)
+    return weight, torch.cat(each(settle, looked))
