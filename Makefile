@@ -8,7 +8,7 @@ READY := $(VENV)/.scenefactory
 # Python edits take effect at once (scenefactory_dev.pth); only what is compiled or declared needs a new install.
 DECLARED := pyproject.toml CMakeLists.txt $(wildcard sf_*/CMakeLists.txt sf_*/*/CMakeLists.txt sf_*/cmake/*.cmake \
 	sf_*/package.xml sf_interfaces/msg/*.msg sf_interfaces/srv/*.srv sf_interfaces/tf2_msgs/msg/*.msg \
-	sf_recon/csrc/* sf_tracking/csrc/*)
+	sf_recon/csrc/* sf_tracking/csrc/* sf_depth/csrc/*)
 
 .PHONY: demo test lint bench bench-full clean setup
 

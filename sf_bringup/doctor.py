@@ -131,6 +131,7 @@ def checks(seconds: float = 3.0) -> list[Check]:
         _import("tf2_msgs.msg"),
         _import("sf_recon._native"),
         _import("sf_tracking._native"),
+        _import("sf_depth._native"),
         _torch,
         _blocks,
         _models,

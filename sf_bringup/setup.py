@@ -25,9 +25,25 @@ setup(
         ),
     ],
     entry_points={
-        # sf_recon and sf_tracking are ament_cmake packages, which declare no entry points of their own.
-        "scenefactory.blocks": ["recon = sf_recon.block:SPEC", "tracking = sf_tracking.block:SPEC"],
-        "scenefactory.parts": ["recon = sf_recon.block:make", "tracking = sf_tracking.block:make"],
+        # sf_depth, sf_recon and sf_tracking are ament_cmake packages, which declare no entry points of their own.
+        "scenefactory.blocks": [
+            "depth = sf_depth.block:SPECS",
+            "recon = sf_recon.block:SPEC",
+            "tracking = sf_tracking.block:SPEC",
+        ],
+        "scenefactory.parts": [
+            "depth:calibrate = sf_depth.block:make_calibrate",
+            "depth:complete = sf_depth.block:make",
+            "depth:mvd = sf_depth.block:make_mvd",
+            "depth:posed = sf_depth.block:make_posed",
+            "depth:slam = sf_depth.block:make_slam",
+            "recon = sf_recon.block:make",
+            "tracking = sf_tracking.block:make",
+        ],
+        "scenefactory.covariance": [
+            "depthcov = sf_depth.core.depthcov:make",
+            "structure = sf_depth.core.covariance:make_structure",
+        ],
         "console_scripts": ["sf = sf_bringup.cli:main"],
     },
 )

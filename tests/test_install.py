@@ -89,7 +89,7 @@ def test_generated_modules_sit_beside_the_vocabulary() -> None:
 
 
 @needs_install
-@pytest.mark.parametrize("block", ["sf_recon", "sf_tracking"])
+@pytest.mark.parametrize("block", ["sf_recon", "sf_tracking", "sf_depth"])
 def test_the_extension_is_compiled(block: str) -> None:
     native = import_module(f"{block}._native")
     assert native.__file__ is not None and native.__file__.endswith(".so")

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
+from sf_depth.core.parallel import each
 from sf_interfaces.types import Float32, Float64
 
 _CELLS = (1, 4, 16, 64)  # px; the densest kept observation per cell of each density
@@ -24,6 +25,7 @@ _CANDIDATES = 16  # nearest observations of each density that a tile chooses fro
 _SECTORS = 16
 _PLANE_TOLERANCE = 0.005  # relative deviation at which an observation counts a quarter for its neighbour's plane
 _PLANE_ROUNDS = 6
+_CHUNK = 8192  # observations a plane is fitted to at once
 _RIDGE = 0.1  # px^2; keeps a slope that its neighbours do not determine at zero
 
 
@@ -56,7 +58,7 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
     everywhere = np.argwhere(measured)
     indices, trees, nears, spacings, first = [], [], [], [], []
     for cell in _CELLS:
-        index = np.argwhere(measured & gap) if cell == 1 else _thinned(everywhere, cell)
+        index = np.argwhere(measured & gap) if cell == 1 else _thinned(measured, cell)
         if indices and len(index) <= _NEIGHBOURS:
             break
         if indices and _SPARSER * len(index) > len(indices[-1]) and cell > 1:
@@ -78,28 +80,36 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
     value = torch.from_numpy(np.ascontiguousarray(ratio[row, col]))
     spacing = torch.from_numpy(np.concatenate(spacings).astype(np.float32))
     variance = torch.from_numpy(np.ascontiguousarray(noise[row, col]))
-    slope = _slopes(x, value, near, spacing)
+    parts = torch.arange(len(x)).split(_CHUNK)
+    slope = torch.cat(each(lambda part: _slopes(x, value, near, spacing, part), parts))
     return Observations(index, x, value, variance, slope, spacing, near, tuple(trees), tuple(first))
 
 
-def _thinned(index: np.ndarray, cell: int) -> np.ndarray:
-    """The observation nearest to the centre of each cell, [M, 2]."""
-    key = (index[:, 0] // cell) * (1 << 20) + index[:, 1] // cell
-    off = ((index % cell - 0.5 * (cell - 1)) ** 2).sum(axis=1)
-    order = np.lexsort((off, key))
-    keep = np.ones(len(order), dtype=bool)
-    keep[1:] = key[order][1:] != key[order][:-1]
-    return index[np.sort(order[keep])]
+def _thinned(measured: np.ndarray, cell: int) -> np.ndarray:
+    """The measured pixel nearest to the centre of each cell, [M, 2] in the order of the image."""
+    (height, width), side = measured.shape, np.arange(cell) - 0.5 * (cell - 1)
+    rows, cols = -(-height // cell), -(-width // cell)
+    padded = np.pad(measured, ((0, rows * cell - height), (0, cols * cell - width)))
+    inside = padded.reshape(rows, cell, cols, cell).swapaxes(1, 2).reshape(rows, cols, cell * cell)
+    off = (side[:, None] ** 2 + side**2).reshape(-1).astype(np.float32)
+    row, col = np.nonzero(inside.any(axis=2))
+    nearest = np.where(inside[row, col], off, np.float32(np.inf)).argmin(axis=1)
+    row, col = row * cell + nearest // cell, col * cell + nearest % cell
+    order = np.lexsort((col, row))
+    return np.stack([row[order], col[order]], axis=1)
 
 
-def _slopes(x: torch.Tensor, ratio: torch.Tensor, near: torch.Tensor, spacing: torch.Tensor) -> torch.Tensor:
-    """Robust plane through every observation, [N, 2]: other surfaces among its neighbours are left out."""
-    d = x[near] - x[:, None]  # [N, M, 2]
-    rise = ratio[near] - ratio[:, None]  # [N, M]
+def _slopes(
+    x: torch.Tensor, ratio: torch.Tensor, near: torch.Tensor, spacing: torch.Tensor, part: torch.Tensor
+) -> torch.Tensor:
+    """Robust plane through some observations, [B, 2]: other surfaces among their neighbours are left out."""
+    own, near, spacing = ratio[part, None], near[part], spacing[part]
+    d = x[near] - x[part, None]  # [B, M, 2]
+    rise = ratio[near] - own  # [B, M]
     dx, dy = d.unbind(dim=2)
     prior = 1.0 / (1.0 + (dx * dx + dy * dy) / spacing[:, None].clamp_min(1.0) ** 2)
-    weight, tolerance = prior, _PLANE_TOLERANCE * ratio[:, None]
-    slope = torch.zeros_like(x)
+    weight, tolerance = prior, _PLANE_TOLERANCE * own
+    slope = torch.zeros_like(x[part])
     for _ in range(_PLANE_ROUNDS):
         wx, wy = weight * dx, weight * dy
         xx, xy, yy = (wx * dx).sum(1) + _RIDGE, (wx * dy).sum(1), (wy * dy).sum(1) + _RIDGE

@@ -4,6 +4,7 @@
 
 Levenberg-Marquardt with a Cauchy kernel. The inverse depths are eliminated by the Schur complement: with
 ``C dd + E^T dx = w`` the depth step is ``dd = C^-1 (w - E^T dx)``, where x holds poses and intrinsics alike.
+The sums over all correspondences are compiled; ``dense_ba_reference`` says what they are.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -15,11 +16,11 @@ import numpy as np
 
 from sf_depth.core import pinhole
 from sf_interfaces.geometry import se3
+from sf_interfaces.native import kernels
 from sf_interfaces.types import Float32, Float64
 
-_MIN_Z = 0.05  # of the reference depth; nearer to a source, or behind it, a point says nothing
-_SINGLE = np.float32  # of the normal equations; residuals and the estimate are in double precision
-_KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
+MIN_Z = 0.05  # of the reference depth; nearer to a source, or behind it, a point says nothing
+KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
 _LEAST_SIGMA = 0.02  # px; correspondences are never better than this
 _FALL = 1e-4  # relative fall of the cost below which the iteration has converged
 _TILES = (9, 12)  # rows and columns of the tiles that count as independent in the covariance
@@ -57,51 +58,64 @@ class Estimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Adjusted:
-    """The optimum with its uncertainty.
+class Optimum:
+    """Where Levenberg-Marquardt has ended.
 
     Args:
         estimate: the optimum.
         iterations: accepted and refused steps.
         sigma: deviation of one coordinate of a correspondence, px.
-        covariance: of poses (translation, rotation; 6 per source, if free) and of f and k1 (or fx fy cx cy), [P, P],
-            free or not: what the camera model leaves out is unsure in given intrinsics, too.
-        inverse_depth_variance: [N], with what poses and intrinsics contribute; inf where nothing was seen.
-        common_variance: the part of it that comes from poses and intrinsics, [N].
         cost: mean robust cost of an observation, px^2.
     """
 
     estimate: Estimate
     iterations: int
     sigma: float
+    cost: float
+
+
+@dataclass(frozen=True, slots=True)
+class Adjusted(Optimum):
+    """The optimum with its uncertainty.
+
+    Args:
+        covariance: of poses (translation, rotation; 6 per source, if free) and of f and k1 (or fx fy cx cy), [P, P],
+            free or not: what the camera model leaves out is unsure in given intrinsics, too.
+        inverse_depth_variance: [N], with what poses and intrinsics contribute; inf where nothing was seen.
+        common_variance: the part of it that comes from poses and intrinsics, [N].
+    """
+
     covariance: Float64
     inverse_depth_variance: Float64
     common_variance: Float64
-    cost: float
 
 
 @dataclass(frozen=True, slots=True)
 class System:
     """Normal equations: H [P, P] and g [P] of poses and intrinsics, C [N] and w [N] of depths, E [P, N] between.
 
-    ``scores`` is what each pixel contributes to g, [P, N].
+    ``scores`` is what each pixel contributes to g, [P, N], where it was asked for.
     """
 
     H: Float64
-    scores: Float32
+    g: Float64
     E: Float32
     C: Float32
     w: Float32
-
-    @property
-    def g(self) -> Float64:
-        """Right side of the poses and intrinsics, [P]."""
-        return np.asarray(self.scores.sum(axis=1, dtype=np.float64))
+    scores: Float32
 
 
 def adjust(
     seen: Observations, start: Estimate, *, poses: bool = True, intrinsics: str = "none", iterations: int = 25
 ) -> Adjusted:
+    """:func:`optimum` with its covariance."""
+    found = optimum(seen, start, poses=poses, intrinsics=intrinsics, iterations=iterations)
+    return with_covariance(seen, found, poses, intrinsics)
+
+
+def optimum(
+    seen: Observations, start: Estimate, *, poses: bool = True, intrinsics: str = "none", iterations: int = 25
+) -> Optimum:
     """Minimise the reprojection error over the inverse depths and whatever is free.
 
     Args:
@@ -110,18 +124,18 @@ def adjust(
         iterations: at most.
     """
     here, damping, done = start, 1e-3, 0
-    r = residuals(seen, here)
+    squares = squared_residuals(seen, here)
     while done < iterations:
-        sigma = _deviation(r, seen.weight)
-        cost = _cost(r, seen.weight, sigma)
+        sigma = _deviation(squares)
+        cost = robust_cost(squares, seen.weight, sigma)
         columns = pinhole.free_columns(here.theta, intrinsics)
-        system = linearise(seen, here, _robust(r, seen.weight, sigma), r, poses, columns)
+        system = linearise(seen, here, sigma, poses, columns)
         better = None
         while better is None and done < iterations:
             done += 1
             there = moved(here, step(system, damping), poses, columns)
-            r_there = residuals(seen, there)
-            new = _cost(r_there, seen.weight, sigma)
+            squares_there = squared_residuals(seen, there)
+            new = robust_cost(squares_there, seen.weight, sigma)
             if new < cost:
                 better, fall = there, (cost - new) / cost
                 damping = max(damping / 10, 1e-9)
@@ -131,123 +145,58 @@ def adjust(
                 damping *= 10
         if better is None:
             break
-        here, r = better, r_there
+        here, squares = better, squares_there
         if fall < _FALL:
             break
-    return _with_covariance(seen, here, r, done, poses, intrinsics)
+    sigma = _deviation(squares)
+    return Optimum(here, done, sigma, robust_cost(squares, seen.weight, sigma))
 
 
-def residuals(seen: Observations, at: Estimate) -> Float64:
-    """x* - Pi(G Pi^-1(x, d)), [S, 2, N] px; NaN where a source cannot see the point."""
-    x = pinhole.rays(at.theta, seen.uv)
-    out = np.empty_like(seen.target)
-    for j, T in enumerate(at.T):
-        X = _transformed(T, x, at.inverse_depth)
-        X[2][X[2] < _MIN_Z] = np.nan
-        out[j] = seen.target[j] - pinhole.project(at.theta, X[:2] / X[2])
-    return out
+def _arrays(seen: Observations, at: Estimate) -> tuple[Float64, ...]:
+    """What the kernels take: theta, T, rays, inverse depth, target, weight."""
+    arrays = (at.theta, at.T, pinhole.rays(at.theta, seen.uv), at.inverse_depth, seen.target, seen.weight)
+    return tuple(np.ascontiguousarray(array, np.float64) for array in arrays)
 
 
-def _transformed(T: Float64, x: Float64, d: Float64) -> Float64:
-    """Points of rays x [2, N] at inverse depth d [N] in a source, in units of the reference depth, [3, N]."""
-    return T[:3, :2] @ x + T[:3, 2:3] + T[:3, 3:] * d
+def squared_residuals(seen: Observations, at: Estimate) -> Float32:
+    """|x* - Pi(G Pi^-1(x, d))|^2, [S, N] px^2; NaN where a source cannot see the point or the weight is 0."""
+    return np.asarray(kernels("sf_depth").squared_residuals(*_arrays(seen, at)))
 
 
-def _squared(r: Float64) -> Float64:
-    return r[:, 0] ** 2 + r[:, 1] ** 2
-
-
-def _deviation(r: Float64, weight: Float64) -> float:
+def _deviation(squares: Float32) -> float:
     """Robust standard deviation of one coordinate, px: the median of a Rayleigh distribution is 1.177 sigma."""
-    lengths = np.sqrt(_squared(r))[weight > 0]
-    lengths = lengths[np.isfinite(lengths)]
-    return max(float(np.median(lengths)) / 1.177 if len(lengths) else 1.0, _LEAST_SIGMA)
+    known = squares[~np.isnan(squares)]
+    return max(float(np.median(np.sqrt(known))) / 1.177 if len(known) else 1.0, _LEAST_SIGMA)
 
 
-def _robust(r: Float64, weight: Float64, sigma: float) -> Float64:
-    """Weights [S, N] of the Cauchy kernel times the confidence; 0 behind a camera."""
-    with np.errstate(invalid="ignore"):
-        w = weight / (1.0 + _squared(r) / (_KERNEL * sigma) ** 2)
-    return np.where(np.isfinite(w), w, 0.0)
+def robust_cost(squares: Float32, weight: Float64, sigma: float) -> float:
+    """Mean Cauchy cost, px^2; a point behind a camera costs as much as one 100 deviations off."""
+    total, weights = kernels("sf_depth").robust_cost(squares, weight, (KERNEL * sigma) ** 2, (100 * sigma) ** 2)
+    return float(total / max(weights, 1e-12))
 
 
-def _cost(r: Float64, weight: Float64, sigma: float) -> float:
-    """Mean robust cost, px^2; a point behind a camera costs as much as one 100 deviations off."""
-    c2 = (_KERNEL * sigma) ** 2
-    squares = _squared(r)
-    squares[~np.isfinite(squares)] = (100 * sigma) ** 2
-    return float((weight * c2 * np.log1p(squares / c2)).sum() / max(weight.sum(), 1e-12))
-
-
-def linearise(seen: Observations, at: Estimate, weight: Float64, r: Float64, poses: bool, columns: Float64) -> System:
-    """Normal equations at an estimate, weights [S, N] and residuals [S, 2, N] given; in single precision."""
-    count, K = len(at.T), columns.shape[1]
-    own = 6 * count if poses else 0
-    P, N = own + K, seen.uv.shape[1]
-    H, scores, E = np.zeros((P, P)), np.zeros((P, N), _SINGLE), np.zeros((P, N), _SINGLE)
-    C, w = np.zeros(N, _SINGLE), np.zeros(N, _SINGLE)
-    x, d = pinhole.rays(at.theta, seen.uv).astype(_SINGLE), at.inverse_depth.astype(_SINGLE)
-    dx = pinhole.rays_jacobian(at.theta, x, columns) if K else np.zeros((2, 0, N), _SINGLE)
-    for j, T in enumerate(at.T):
-        A, a = jacobians(at.theta, T, x, dx, d, poses, columns)
-        root = np.sqrt(weight[j]).astype(_SINGLE)
-        A *= root  # 0 where the source is blind, and what was clipped there is finite
-        a *= root
-        b = np.where(root > 0, r[j], 0.0).astype(_SINGLE) * root
-        flat = A.reshape(len(A), 2 * N)
-        rows = np.r_[6 * j : 6 * j + 6, own:P] if poses else np.arange(own, P)
-        H[np.ix_(rows, rows)] += flat @ flat.T
-        pose, count = slice(6 * j, 6 * j + 6), len(A) - K
-        for total, (first, second) in ((scores, b), (E, a)):
-            part = A[:, 0] * first + A[:, 1] * second
-            total[pose][:count] = part[:count]  # of this source alone
-            total[own:] += part[count:]
-        C += a[0] ** 2 + a[1] ** 2
-        w += a[0] * b[0] + a[1] * b[1]
-    return System(H, scores, E, C, w)
-
-
-def jacobians(
-    theta: Float64, T: Float64, x: Float64, dx: Float64, d: Float64, poses: bool, columns: Float64
-) -> tuple[Float64, Float64]:
-    """d Pi / d (pose, phi) [6 + K, 2, N] and d Pi / d d [2, N] of one source, in the precision of ``x``."""
-    theta, T, columns = (array.astype(x.dtype, copy=False) for array in (theta, T, columns))
-    X = _transformed(T, x, d)
-    inverse_z = 1.0 / np.maximum(X[2], _MIN_Z)
-    y = X[:2] * inverse_z
-    uu, uv, vv = pinhole.project_jacobian(theta, y)
-    J = np.empty((3, 2, len(d)), x.dtype)  # d uv / d (point in the source)
-    J[0] = theta[0] * inverse_z * uu, theta[1] * inverse_z * uv
-    J[1] = theta[0] * inverse_z * uv, theta[1] * inverse_z * vv
-    J[2] = -(y[0] * J[0] + y[1] * J[1])
-    A = np.empty(((6 if poses else 0) + columns.shape[1], 2, len(d)), x.dtype)
-    if poses:
-        A[:3] = J * d  # translations act on the point of unit ray in proportion to its inverse depth
-        A[3] = X[1] * J[2] - X[2] * J[1]
-        A[4] = X[2] * J[0] - X[0] * J[2]
-        A[5] = X[0] * J[1] - X[1] * J[0]
-    if columns.shape[1]:
-        own = pinhole.project_parameters(theta, y, columns)
-        for k in range(columns.shape[1]):
-            v = T[:3, :2] @ dx[:, k]
-            A[k - columns.shape[1]] = v[0] * J[0] + v[1] * J[1] + v[2] * J[2] + own[:, k]
-    t = T[:3, 3]
-    return A, t[0] * J[0] + t[1] * J[1] + t[2] * J[2]
+def linearise(
+    seen: Observations, at: Estimate, sigma: float, poses: bool, columns: Float64, scores: bool = False
+) -> System:
+    """Normal equations at an estimate with the Cauchy weights of a deviation ``sigma`` px."""
+    x = pinhole.rays(at.theta, seen.uv).astype(np.float32)
+    dx = pinhole.rays_jacobian(at.theta, x, columns) if columns.shape[1] else np.zeros((2, 0, 0), np.float32)
+    arrays = (*_arrays(seen, at), np.ascontiguousarray(dx), np.ascontiguousarray(columns))
+    return System(*kernels("sf_depth").linearise(*arrays, poses, (KERNEL * sigma) ** 2, scores))
 
 
 def step(system: System, damping: float) -> tuple[Float64, Float64]:
     """Damped step (dx [P], dd [N]); damping is relative to each diagonal, so it scales with the residuals."""
-    C = system.C * _SINGLE(1.0 + damping) + _least_information(system.C)
-    scaled = system.E / C
-    S = system.H - scaled @ system.E.T
+    C = system.C * np.float32(1.0 + damping) + least_information(system.C)
+    S, b = kernels("sf_depth").eliminate(system.E, C, system.w, system.H, system.g)
     S[np.diag_indices_from(S)] += damping * np.diag(system.H) + 1e-12 * np.trace(system.H)
-    dx = np.linalg.solve(S, system.g - scaled @ system.w) if len(S) else np.zeros(0)
-    return dx, (system.w - system.E.T @ dx.astype(_SINGLE)) / C
+    dx = np.linalg.solve(S, b) if len(S) else np.zeros(0)
+    return dx, kernels("sf_depth").substitute(system.E, C, system.w, dx)
 
 
-def _least_information(C: Float32) -> np.float32:
+def least_information(C: Float32) -> np.float32:
     """Keeps depths that nothing constrains where they are."""
-    return _SINGLE(1e-6 * float(np.median(C)) + 1e-30)
+    return np.float32(1e-6 * float(np.median(C)) + 1e-30)
 
 
 def moved(at: Estimate, step: tuple[Float64, Float64], poses: bool, columns: Float64) -> Estimate:
@@ -260,16 +209,14 @@ def moved(at: Estimate, step: tuple[Float64, Float64], poses: bool, columns: Flo
     return Estimate(theta, T, d)
 
 
-def _with_covariance(
-    seen: Observations, at: Estimate, r: Float64, iterations: int, poses: bool, intrinsics: str
-) -> Adjusted:
+def with_covariance(seen: Observations, found: Optimum, poses: bool, intrinsics: str) -> Adjusted:
     """Posterior covariance at the optimum. The scale, which nothing observes, counts as known."""
-    sigma = _deviation(r, seen.weight)
+    at, sigma = found.estimate, found.sigma
     columns = pinhole.free_columns(at.theta, "pinhole" if intrinsics == "pinhole" else "radial")
-    system = linearise(seen, at, _robust(r, seen.weight, sigma), r, poses, columns)
-    C = system.C + _least_information(system.C)
+    system = linearise(seen, at, sigma, poses, columns, scores=True)
+    C = system.C + least_information(system.C)
     scaled = system.E / C
-    S = system.H - scaled @ system.E.T
+    S, _ = kernels("sf_depth").eliminate(system.E, C, system.w, system.H, system.g)
     if poses and len(S):
         gauge = np.zeros(len(S))
         for j, T in enumerate(at.T):
@@ -278,10 +225,10 @@ def _with_covariance(
     scores = system.scores - scaled * system.w  # of poses and intrinsics alone, [P, N]
     inverse = np.linalg.pinv(S, hermitian=True) if len(S) else S
     covariance = inverse @ _spread(seen.uv, scores, sigma**2 * S) @ inverse
-    common = (scaled * (covariance.astype(_SINGLE) @ scaled)).sum(axis=0)
+    common = (scaled * (covariance.astype(np.float32) @ scaled)).sum(axis=0)
     with np.errstate(divide="ignore"):
         variance = sigma**2 / system.C + common
-    return Adjusted(at, iterations, sigma, covariance, variance, common, _cost(r, seen.weight, sigma))
+    return Adjusted(at, found.iterations, sigma, found.cost, covariance, variance, common)
 
 
 def _spread(uv: Float64, scores: Float64, independent: Float64) -> Float64:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 
 from sf_depth.core.conditioning import Observations
+from sf_depth.core.parallel import each
 
 _TRUST = 3.0  # a plane is extended this many spacings of its observations
 _CLIP = 1.3  # and changes by this factor at most
@@ -19,6 +20,7 @@ _AGREE = 0.03  # relative deviation of planes that belong to one surface
 _SUSPECT = 1.0  # log distance behind its surroundings at which an observation counts half
 _SAMPLES = (0.25, 0.5, 0.75)  # where the colour is looked up between a pixel and an observation
 _BARRIER = 0.7  # how much a colour step in between counts against one at the ends
+_CHUNK = 8192  # observations weighed at once; fewer keep the cores waiting for the interpreter
 _SOFT = 0.25  # share of the spacing below which all observations are equally near
 
 
@@ -96,12 +98,18 @@ def reliability(observed: Observations, color: torch.Tensor) -> tuple[torch.Tens
     A point that lies behind all that surround it was seen past an edge or through glass: the sensor does not
     stand where the camera does, and the camera sees what is in front.
     """
-    x = observed.x[:, None]
-    seen = look(observed, observed.near, x, color)
-    around = _median(seen.value, seen.affinity / (seen.square + 1e-3))[:, 0]
-    behind = torch.log(around / observed.ratio).clamp_min(0.0) / _SUSPECT
-    weight = 1.0 / (1.0 + behind * behind)
     ids = torch.cat([torch.arange(len(observed.ratio))[:, None], observed.near], dim=1)
-    seen = look(observed, ids, x, color)
-    trust = seen.affinity * weight[ids][..., None]
-    return weight, _smooth(seen, observed.ratio[:, None], trust, observed.spacing)[:, 0]
+
+    def weigh(part: torch.Tensor) -> tuple[Neighbourhood, torch.Tensor]:
+        seen = look(observed, part, observed.x[part[:, :1]], color)
+        around = _median(seen.value[:, 1:], seen.affinity[:, 1:] / (seen.square[:, 1:] + 1e-3))[:, 0]
+        behind = torch.log(around / observed.ratio[part[:, 0]]).clamp_min(0.0) / _SUSPECT
+        return seen, 1.0 / (1.0 + behind * behind)
+
+    def settle(seen: Neighbourhood) -> torch.Tensor:
+        trust = seen.affinity * weight[seen.ids][..., None]
+        return _smooth(seen, observed.ratio[seen.ids[:, :1]], trust, observed.spacing)[:, 0]
+
+    looked, weights = zip(*each(weigh, ids.split(_CHUNK)), strict=True)
+    weight = torch.cat(weights)
+    return weight, torch.cat(each(settle, looked))

@@ -30,6 +30,9 @@ _LEAST_CONTRAST = 2.0  # grey levels; below it an image is blank
 _CHECK_ROUNDS = 2  # the checks and dense BA improve each other
 _NOISY_POSES = 1.5  # given poses that leave so many times the residual of free ones are refined
 _LEAST_KEPT = 0.3  # share of the correspondences that given poses have to explain to be kept at all
+_BENT = {"none": "lens", "f": "radial"}  # what is free with a radial term
+_LENS = 0.01  # share of the cost that a radial term has to explain; 0.003 is the most where there is no lens
+_SURE = 0.01  # deviation of an unknown focal length; less sure, it and the radial term make up for each other
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
 _BLOCK = 1 << 15  # pixels solved at once: their arrays stay in the cache
 CONTRADICTED = "given poses contradict the images: refined, they only give the scale, and the variance tells how well"
@@ -47,7 +50,7 @@ class Recovered:
         registered: which sources keep enough correspondences, [S].
         focal_sigma: posterior deviation of the focal length relative to it; 0 where it was given.
         sigma: deviation of a correspondence, px.
-        distortion: radial term k1 of the images, 0 unless it was estimated.
+        distortion: radial term k1 of the images, 0 unless they show one.
         contradicted: given poses fit the images so badly that they were refined and only give the scale.
     """
 
@@ -136,6 +139,8 @@ class MultiViewDepth:
             at = fit.adjusted.estimate
             at = _triangulated(matched.seen, at.theta, at.T)
             fit = self._check_and_adjust(matched.seen, at, size, not kept, free)
+        if T is None:
+            fit = self._with_lens(matched.seen, fit, size, free)
         if theta is not None and T is not None:
             fit = self._refine_noisy_poses(matched.seen, fit, size) if kept else _scaled(fit, T)
         depth = _dense(matched, fit, size)
@@ -175,9 +180,26 @@ class MultiViewDepth:
                     "scene; give views that are a tenth of the distance to the scene apart"
                 )
             good = Observations(seen.uv, seen.target, weight)
-            adjusted = dense_ba.adjust(good, at, poses=poses, intrinsics=intrinsics)
-            at = adjusted.estimate
-        return _Fit(adjusted, good)
+            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
+            at = found.estimate
+        return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
+
+    def _with_lens(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
+        """The fit with a radial term where the images show a lens, otherwise as it was.
+
+        Beside an unknown focal length only where the views tell both.
+        """
+        bent = _BENT.get(free) if self._config.lens else None
+        if bent is None:
+            return fit
+        found = dense_ba.optimum(fit.seen, fit.adjusted.estimate, intrinsics=bent)
+        if found.cost > (1.0 - _LENS) * fit.adjusted.cost:
+            return fit
+        if free == "f":
+            deviation = dense_depth.focal_deviation(dense_ba.with_covariance(fit.seen, found, True, bent))
+            if deviation > _SURE:
+                return fit
+        return self._check_and_adjust(seen, found.estimate, size, True, bent)
 
     def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
         """The fit with poses as given; None if they contradict the correspondences, or explain few of them."""

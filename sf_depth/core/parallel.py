@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from typing import Any, TypeVar
 
 import scipy.linalg  # noqa: F401  # brings a BLAS of its own, which has to be loaded before it can be limited
+import torch
 from threadpoolctl import ThreadpoolController
 
 _T = TypeVar("_T")
@@ -31,3 +32,14 @@ def _blas() -> ThreadpoolController:
 def one_blas_thread() -> AbstractContextManager[Any]:
     """While it is entered BLAS uses one thread: with more, the order of its sums follows their number."""
     return _blas().limit(limits=1, user_api="blas")
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """While it is entered the operations of PyTorch use one thread each, here and in the threads of :func:`each`."""
+    count = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(count)

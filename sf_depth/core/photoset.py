@@ -2,6 +2,7 @@
 
 Each image in turn is the reference of U2-MVD with the images it overlaps best. The first one, which overlaps
 most, fixes the intrinsics, the map frame and the unit; the others join at the scale of the poses known by then.
+A lens that it shows is taken out of all images, since a camera here is a pinhole.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -24,6 +25,7 @@ from sf_depth.core.scale import GlobalScale, from_translations, in_unit
 from sf_depth.core.seeds import Features, detect, match_features
 from sf_interfaces.errors import FormatError, InsufficientParallax
 from sf_interfaces.geometry import se3
+from sf_interfaces.geometry.undistort import Distortion, undistort_image
 from sf_interfaces.types import Camera, DepthMap, Float64, Frame, Keyframe, Scale, Trajectory, UInt8
 
 _ENOUGH_MOTION = 0.05  # image widths; matched views that differ less are worth less
@@ -41,7 +43,7 @@ class PhotoSet:
         trajectory: T_map_camera of all registered images.
         camera: intrinsics of the (full-size) images.
         recovered: what the first reference gave, with the certainty of the intrinsics.
-        reasons: why images were left out.
+        reasons: why images were left out, rectified, or their poses refined.
     """
 
     observed: list[Keyframe]
@@ -61,7 +63,7 @@ class PhotoSetDepth:
 
     def __init__(self, config: DepthConfig) -> None:
         self._config = config
-        self._mvd = MultiViewDepth(config)
+        self._mvd, self._rectified = (MultiViewDepth(c) for c in (config, replace(config, lens=False)))
         self._filler = Filler(config)
 
     def estimate(self, frames: Sequence[Frame], heard: Callable[[int], None] = lambda done: None) -> PhotoSet:
@@ -92,10 +94,17 @@ class PhotoSetDepth:
         return work.product()
 
     def recover(
-        self, images: list[UInt8], reference: int, sources: list[int], camera: Camera | None, T: Float64 | None
+        self,
+        images: list[UInt8],
+        reference: int,
+        sources: list[int],
+        camera: Camera | None,
+        T: Float64 | None,
+        lens: bool = False,
     ) -> Recovered:
-        """One reference with its sources."""
-        return self._mvd.recover(images[reference], [images[j] for j in sources], camera, T)
+        """One reference with its sources; ``lens``: the images may show one."""
+        mvd = self._mvd if lens else self._rectified
+        return mvd.recover(images[reference], [images[j] for j in sources], camera, T)
 
     def complete(self, keyframe: Keyframe) -> Keyframe:
         """Fill the pixels that were not triangulated."""
@@ -203,7 +212,11 @@ class _Work:
         T = None
         if self._given is not None:
             T = np.stack([se3.inverse(self._poses[j]) @ self._poses[reference] for j in sources])
-        got = self._parts.recover(self._images, reference, sources, self._camera, T)
+        got = self._parts.recover(self._images, reference, sources, self._camera, T, lens=first)
+        if first and got.distortion:
+            self._rectify(got)
+            again = self._parts.recover(self._images, reference, sources, got.camera, T)
+            got = replace(again, focal_sigma=got.focal_sigma, distortion=got.distortion)
         if got.contradicted:
             self._count(CONTRADICTED)
         scale = GlobalScale(1.0, 0.0)
@@ -218,6 +231,18 @@ class _Work:
                 step[:3, 3] *= scale.factor
                 self._poses[j] = self._poses[reference] @ se3.inverse(step)
         self._depth[reference] = in_unit(got.depth, scale)
+
+    def _rectify(self, got: Recovered) -> None:
+        """Take the lens that the first reference shows out of all images."""
+        lens = Distortion("plumb_bob", (got.distortion, 0.0, 0.0, 0.0, 0.0))
+        self._images = [undistort_image(image, got.camera, lens) for image in self._images]
+        frames = []
+        for frame in self._frames:
+            assert frame.image is not None
+            camera = self._full or _resized(got.camera, frame.image)
+            frames.append(replace(frame, image=undistort_image(frame.image, camera, lens)))
+        self._frames = frames
+        self._count(f"the images show a lens, radial term {got.distortion:.3f}: rectified")
 
     def _sources(self, reference: int, limit: int) -> list[int]:
         """The images that overlap best; at least two of them placed already, so that the scale is known."""

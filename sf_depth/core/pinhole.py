@@ -14,7 +14,7 @@ from sf_interfaces.types import Camera, Float64
 
 # Columns of d theta / d phi: the free parameters phi are logarithms of focal lengths, shifts of the principal
 # point in focal lengths, and k1. All are of order one, whatever the image size.
-_COLUMNS = {"none": (), "f": ("f",), "pinhole": ("fx", "fy", "cx", "cy"), "radial": ("f", "k1")}
+_COLUMNS = {"none": (), "f": ("f",), "pinhole": ("fx", "fy", "cx", "cy"), "radial": ("f", "k1"), "lens": ("k1",)}
 _NEWTON_STEPS = 3
 
 

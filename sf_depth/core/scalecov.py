@@ -21,11 +21,12 @@ from sf_depth.core.calibration import Calibration, calibrate, held_out
 from sf_depth.core.conditioning import Observations, choose, observe
 from sf_depth.core.covariance import CovarianceModel, PixelCovariance, make_covariance
 from sf_depth.core.layers import at, layer, look, reliability
+from sf_depth.core.parallel import each, one_torch_thread
 from sf_interfaces.errors import FormatError
 from sf_interfaces.types import DepthMap, Float32, UInt8
 
 MIN_OBSERVATIONS = 4  # a plane and one to spare
-_CHUNK = 256  # tiles solved at once; few enough to stay in the cache of the processor
+_CHUNK = 1024  # tiles solved at once; fewer keep the cores waiting for the interpreter
 _LAYER_SCALE = 0.15  # difference of log scale over which correlation falls to 0.6
 _MIN_AMPLITUDE = 1e-8  # variance of log scale that is left on a perfect plane
 
@@ -58,8 +59,9 @@ def complete(
     if measured.all():
         return DepthMap(observed.z, sensor, observed.scale)
     base = np.ones_like(observed.z) if base is None else np.asarray(base, np.float32)
-    regression = _Regression.of(base, observed.z, sensor, measured, image, config, covariance)
-    log_scale, variance = regression.image(measured)
+    with one_torch_thread():  # tiles are spread over the cores, not their sums
+        regression = _Regression.of(base, observed.z, sensor, measured, image, config, covariance)
+        log_scale, variance = regression.image(measured)
     z = np.where(measured, observed.z, base * np.exp(log_scale))
     best = sensor[measured].min()  # what the sensor gets wrong everywhere, no regression can see
     variance = np.where(measured, sensor, np.maximum(z * z * variance, best))
@@ -133,16 +135,19 @@ class _Regression:
         padded[:height, :width] = measured
         corner = size * np.argwhere(~padded.reshape(rows, size, cols, size).all(axis=(1, 3)))
         inside = np.indices((size, size)).reshape(2, -1).T
-        ids = choose(self.observed, corner + 0.5 * (size - 1), self.config.neighbours)
         calibration = self._calibrated(measured)
         mean, variance = np.zeros((2, height, width), dtype=np.float32)
-        for start in range(0, len(corner), _CHUNK):
-            part = slice(start, start + _CHUNK)
-            pixel = np.minimum(corner[part, None] + inside, (height - 1, width - 1))
+
+        def solve(start: int) -> None:
+            part = corner[start : start + _CHUNK]
+            ids = choose(self.observed, part + 0.5 * (size - 1), self.config.neighbours)
+            pixel = np.minimum(part[:, None] + inside, (height - 1, width - 1))
             x = torch.from_numpy(pixel[..., ::-1].astype(np.float32))
             row, col = pixel[..., 0], pixel[..., 1]
-            mean[row, col], raw = self._regress(ids[part], x)
+            mean[row, col], raw = self._regress(ids, x)
             variance[row, col] = calibration(raw)
+
+        each(solve, range(0, len(corner), _CHUNK))
         return mean, variance
 
     def _regress(self, ids: torch.Tensor, x: torch.Tensor) -> tuple[Float32, Float32]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from sf_depth.core import dense_ba, pinhole
 from sf_depth.core.dense_ba import Estimate, Observations
+from sf_depth.core.parallel import each
 from sf_interfaces.errors import InsufficientParallax
 from sf_interfaces.types import Float64
 
@@ -63,9 +64,9 @@ def start(seen: Observations, size: Size, theta: Float64 | None) -> Estimate:
     if theta is not None:
         best = _refined(few, _from_essentials(few, size, theta), "none")
     else:
-        tried = [_refined(few, _from_essentials(few, size, _centred(size, f)), "none") for f in _SWEEP]
-        tried.sort(key=lambda adjusted: adjusted.cost)
-        best = min((_refined(few, one.estimate, "f") for one in tried[:3]), key=lambda adjusted: adjusted.cost)
+        tried = each(lambda f: _refined(few, _from_essentials(few, size, _centred(size, f)), "none"), _SWEEP)
+        tried.sort(key=lambda found: found.cost)
+        best = min(each(lambda one: _refined(few, one.estimate, "f"), tried[:3]), key=lambda found: found.cost)
     at = _canonical(best.estimate)
     return replace(at, inverse_depth=triangulate(seen, at))
 
@@ -75,8 +76,8 @@ def _centred(size: Size, focal: float) -> Float64:
     return np.array([f, f, size.width / 2, size.height / 2, 0.0])
 
 
-def _refined(seen: Observations, at: Estimate, intrinsics: str) -> dense_ba.Adjusted:
-    return dense_ba.adjust(seen, at, intrinsics=intrinsics, iterations=_TRIAL if intrinsics == "none" else 15)
+def _refined(seen: Observations, at: Estimate, intrinsics: str) -> dense_ba.Optimum:
+    return dense_ba.optimum(seen, at, intrinsics=intrinsics, iterations=_TRIAL if intrinsics == "none" else 15)
 
 
 def _canonical(at: Estimate) -> Estimate:

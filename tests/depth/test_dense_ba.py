@@ -10,6 +10,7 @@ import pytest
 from views import exact, rotation_error_deg
 
 from sf_depth.core import dense_ba, pinhole
+from sf_depth.core import dense_ba_reference as reference
 from sf_depth.core.dense_ba import Estimate, Observations
 from sf_depth.core.start import Size, start
 from sf_interfaces.errors import ConfigError, InsufficientParallax
@@ -46,11 +47,11 @@ def test_jacobians_match_differences() -> None:
     columns = pinhole.free_columns(truth.theta, "radial")
     x = pinhole.rays(truth.theta, seen.uv)
     dx = pinhole.rays_jacobian(truth.theta, x, columns)
-    A, a = dense_ba.jacobians(truth.theta, truth.T[0], x, dx, truth.inverse_depth, True, columns)
+    A, a = reference.jacobians(truth.theta, truth.T[0], x, dx, truth.inverse_depth, True, columns)
 
     def predicted(step: np.ndarray, dd: float = 0.0) -> np.ndarray:
         there = dense_ba.moved(truth, (step, np.full(7, dd)), True, columns)
-        return seen.target[0] - dense_ba.residuals(seen, there)[0]
+        return seen.target[0] - reference.residuals(seen, there)[0]
 
     for k in range(8):
         step = 1e-6 * np.eye(8)[k]
@@ -64,8 +65,7 @@ def test_one_step_solves_the_full_normal_equations() -> None:
     seen, truth = exact(count=40, sources=2)
     at = disturbed(truth, 0.9)
     columns = pinhole.free_columns(at.theta, "pinhole")
-    r = dense_ba.residuals(seen, at)
-    system = dense_ba.linearise(seen, at, seen.weight, r, True, columns)
+    system = dense_ba.linearise(seen, at, 1.0, True, columns)
     P, N = system.E.shape
     whole = np.zeros((P + N, P + N))
     whole[:P, :P], whole[:P, P:], whole[P:, :P] = system.H, system.E, system.E.T
@@ -76,6 +76,40 @@ def test_one_step_solves_the_full_normal_equations() -> None:
     dx, dd = dense_ba.step(system, damping)
     np.testing.assert_allclose(dx, expected[:P], rtol=1e-2, atol=1e-5)
     np.testing.assert_allclose(dd, expected[P:], rtol=1e-2, atol=1e-4)
+
+
+def close(found: np.ndarray, expected: np.ndarray) -> None:
+    """Within 1e-5 of the largest value."""
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max(initial=1e-30))
+
+
+@pytest.mark.parametrize("free, k1", [("none", 0.0), ("f", 0.0), ("pinhole", 0.0), ("radial", -0.1)])
+@pytest.mark.parametrize("poses", [True, False])
+def test_the_kernels_compute_what_the_reference_says(free: str, k1: float, poses: bool) -> None:
+    seen, truth = exact(count=1307, k1=k1)  # blocks and vectors that do not come out even
+    rng = np.random.default_rng(0)
+    weight = rng.random(seen.weight.shape) * (rng.random(seen.weight.shape) < 0.8)
+    seen = Observations(seen.uv, np.where(weight[:, None] > 0, seen.target, np.nan), weight)
+    T = truth.T.copy()
+    T[0, 2, 3] -= 1.5  # some points lie behind it
+    at = replace(truth, T=T, inverse_depth=truth.inverse_depth * rng.uniform(0.97, 1.03, 1307))
+    columns = pinhole.free_columns(at.theta, free)
+
+    r = reference.residuals(seen, at)
+    squares = dense_ba.squared_residuals(seen, at)
+    expected = np.where(weight > 0, reference.squared(r), np.nan)
+    assert np.isnan(r[0, 0][weight[0] > 0]).any()
+    np.testing.assert_allclose(squares, expected, rtol=1e-6)
+    np.testing.assert_allclose(dense_ba.robust_cost(squares, weight, 0.7), reference.cost(r, weight, 0.7), rtol=1e-6)
+
+    system = dense_ba.linearise(seen, at, 0.7, poses, columns, scores=True)
+    said = reference.linearise(seen, at, reference.robust(r, weight, 0.7), r, poses, columns)
+    for name in ("H", "g", "E", "C", "w", "scores"):
+        close(getattr(system, name), getattr(said, name))
+    dx, dd = dense_ba.step(said, 1e-3)
+    expected_dx, expected_dd = reference.step(said, 1e-3)
+    np.testing.assert_allclose(dx, expected_dx, rtol=1e-3, atol=1e-5)  # as far as the free scale lets them
+    close(dd, expected_dd) if not poses else np.testing.assert_allclose(dd, expected_dd, rtol=1e-2, atol=1e-4)
 
 
 def test_deviations_hold_what_they_promise() -> None:
@@ -128,8 +162,8 @@ def test_no_parallax_is_said_in_words(known: bool, turning: bool) -> None:
     if not turning:
         T[:] = np.eye(4)
     blank = Observations(seen.uv, np.zeros_like(seen.target), seen.weight)
-    noise = dense_ba.residuals(seen, truth)
-    target = -dense_ba.residuals(blank, replace(truth, T=T)) + noise
+    noise = reference.residuals(seen, truth)
+    target = -reference.residuals(blank, replace(truth, T=T)) + noise
     with pytest.raises(InsufficientParallax, match="no parallax"):
         start(replace(seen, target=target), SIZE, truth.theta if known else None)
 

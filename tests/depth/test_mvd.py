@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_limits
 from views import Views, room, rotation_error_deg
 
 from sf_depth.config import DepthConfig
-from sf_depth.core import matching
+from sf_depth.core import matching, pinhole
 from sf_depth.core.calibrate import Calibrator
 from sf_depth.core.matching import FlowMatcher, load_matcher, pixel_grid
 from sf_depth.core.mvd import MultiViewDepth, Recovered
@@ -44,6 +44,32 @@ def test_depth_is_right_in_all_three_settings(mode: str) -> None:
     assert rotation_error_deg(found.T_source_reference, views.T_source_reference) < 0.3
     assert abs(found.camera.fx / views.camera.fx - 1) < 0.01
     assert (found.focal_sigma > 0) == (mode == "unknown")
+    assert found.distortion == 0.0
+
+
+def through_a_lens(views: Views, k1: float) -> list[np.ndarray]:
+    """The images with a radial term."""
+    theta = pinhole.theta_of(views.camera)
+    x = pinhole.rays(np.append(theta[:4], k1), pixel_grid(views.images[0].shape).reshape(-1, 2).T.astype(np.float64))
+    at = pinhole.project(theta, x).T.reshape(*views.images[0].shape[:2], 2).astype(np.float32)
+    return [matching.sample(image, at) for image in views.images]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_a_lens_that_the_images_show_is_found_and_taken_out(known: bool) -> None:
+    views, k1 = room(), -0.08
+    bent, camera = through_a_lens(views, k1), views.camera if known else None
+    found = MVD.recover(bent[0], bent[1:], camera)
+    assert abs(found.distortion / k1 - 1) < 0.15 and abs(found.camera.fx / views.camera.fx - 1) < 0.01
+    frames = [Frame(i, camera, image) for i, image in enumerate(bent)]
+    made = PhotoSetDepth(DepthConfig()).estimate(frames)
+    assert any("a lens" in reason for reason in made.reasons)
+    first = next(k for k in made.observed if k.stamp_ns == 0)
+    inside = (slice(20, -20), slice(20, -20))
+    assert np.mean(np.abs(first.image[inside].astype(float) - views.images[0][inside])) < 0.6 * np.mean(
+        np.abs(bent[0][inside].astype(float) - views.images[0][inside])
+    )
+    assert relative_error(first.depth, views.z[0], absolute=False).mean() < 0.02
 
 
 def test_the_number_of_threads_changes_nothing() -> None:

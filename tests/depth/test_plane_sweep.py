@@ -6,14 +6,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from views import CAMERA
 
 from sf_depth.config import DepthConfig
 from sf_depth.core import pinhole, plane_sweep
+from sf_depth.core import plane_sweep_reference as reference
 from sf_depth.core.dense_ba import Estimate
 from sf_depth.core.filling import Filler
 from sf_depth.core.mvd import MultiViewDepth
+from sf_interfaces.geometry import se3
 from sf_interfaces.types import Keyframe
 
 NEAR, FAR = 1.0, 4.0
@@ -76,11 +79,28 @@ def test_one_path_is_the_best_of_all_assignments() -> None:
     rng = np.random.default_rng(1)
     cost = rng.random((4, 1, 3)).astype(np.float32)
     image = np.array([[0.0], [30.0], [30.0], [0.0]], np.float32)
-    total = plane_sweep._path(cost, image)[-1, 0]
-    steps = [max(plane_sweep._BREAK / (1 + d / plane_sweep._EDGE), plane_sweep._BEND) for d in (30.0, 0.0, 30.0)]
+    total = (plane_sweep.best_paths(cost, image, True) - cost)[-1, 0]  # what comes from below is no path yet
+    steps = [max(plane_sweep.BREAK / (1 + d / plane_sweep.EDGE), plane_sweep.BEND) for d in (30.0, 0.0, 30.0)]
     best = np.full(3, np.inf)
     for labels in np.ndindex(3, 3, 3, 3):
         jumps = np.abs(np.diff(labels))
-        price = sum(0 if j == 0 else plane_sweep._BEND if j == 1 else s for j, s in zip(jumps, steps, strict=True))
+        price = sum(0 if j == 0 else plane_sweep.BEND if j == 1 else s for j, s in zip(jumps, steps, strict=True))
         best[labels[-1]] = min(best[labels[-1]], price + sum(cost[i, 0, k] for i, k in enumerate(labels)))
     np.testing.assert_allclose(total - total.min(), best - best.min(), atol=1e-5)
+
+
+@pytest.mark.parametrize("sources", [1, 3])
+def test_the_kernels_compute_what_the_reference_says(sources: int) -> None:
+    rng = np.random.default_rng(2)
+    first, *others = rng.uniform(0, 255, (1 + sources, 22, 37)).astype(np.float32)
+    theta = np.array([120.0, 118.0, 74.0, 43.0, -0.05])
+    at = Estimate(theta, se3.exp(rng.normal(0, 0.1, (sources, 6))), np.ones(1))
+    compared = plane_sweep.Compared(first, others, at, 4.0, 4.1)
+    for d in np.float32([0.1, 1.0, 3.0]):
+        expected = reference.dissimilarity(compared, d)
+        assert (expected == plane_sweep.UNSEEN).any()
+        np.testing.assert_allclose(compared.dissimilarity(d), expected, atol=2e-4)  # grey levels cancel in variances
+    cost = rng.random((22, 37, 19)).astype(np.float32)
+    for upright in (True, False):
+        expected = reference.best_paths(cost, first, upright)
+        np.testing.assert_allclose(plane_sweep.best_paths(cost, first, upright), expected, rtol=1e-5)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sf_bringup.simulate.render import Renderer
 from sf_bringup.simulate.scenes import SCENES
-from sf_depth.core import dense_ba
+from sf_depth.core import dense_ba_reference as reference
 from sf_depth.core.dense_ba import Estimate, Observations
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float32, Float64, UInt8
@@ -66,7 +66,7 @@ def exact(
     T = se3.exp(np.hstack([rng.normal(0, 0.3, (sources, 3)), rng.normal(0, 0.08, (sources, 3))]))
     truth = Estimate(theta, T, d)
     blank = Observations(uv, np.zeros((sources, 2, count)), np.ones((sources, count)))
-    target = -dense_ba.residuals(blank, truth) + rng.normal(0, noise, (sources, 2, count))
+    target = -reference.residuals(blank, truth) + rng.normal(0, noise, (sources, 2, count))
     return Observations(uv, target, np.ones((sources, count))), truth
 
 
