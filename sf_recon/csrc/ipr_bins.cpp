@@ -9,16 +9,16 @@ namespace {
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr size_t kBlock = 512;   // points projected at a time, into the cache
 constexpr size_t kLanes = 16;   // of the widest vectors
-constexpr size_t kChunk = 8192;  // points a thread takes at a time
+constexpr size_t kChunk = 8192;   // points a thread takes at a time
 
 // Points of a block that may be seen, and where they lie in the image.
 struct Seen {
     size_t n = 0;
-    int32_t row[kBlock];        // in the block
+    int32_t row[kBlock];  // in the block
     float point[3 * kBlock];
     Fragment fragment[kBlock];
     Window tiles[kBlock];
-    uint8_t kind[kBlock];       // see Kind
+    uint8_t kind[kBlock];  // see Kind
 };
 
 enum Kind : uint8_t { kHidden, kNarrow, kWide };  // a wide point may cover a whole tile
@@ -29,9 +29,10 @@ SF_SIMD void test_block(const RasterSpec& spec, const float* points, size_t n, u
     for (size_t i = 0; i < n; ++i) may_show[i] = frustum.may_show(s, points + 3 * i);
 }
 
-void pick_block(const RasterSpec& spec, const float* points, size_t n, Seen& out) {
+// The memory is asked for the points up to `ahead` meanwhile.
+void pick_block(const RasterSpec& spec, const float* points, size_t n, size_t ahead, Seen& out) {
     uint8_t may_show[kBlock];
-    for (size_t i = 0; i < 3 * n; i += 16) __builtin_prefetch(points + 3 * kBlock + i);  // of the next block
+    for (size_t i = 3 * n; i < 3 * ahead; i += 64 / sizeof(float)) __builtin_prefetch(points + i);
     test_block(spec, points, n, may_show);
     out.n = 0;
     for (size_t i = 0; i < n; ++i) {
@@ -77,7 +78,7 @@ Fragment* Lots::fresh(size_t tile) {
 void Binner::project(const float* points, size_t first, size_t last, const RasterSpec& s, Worker& worker) const {
     Seen seen;
     for (size_t start = first; start < last; start += kBlock) {
-        pick_block(s, points + 3 * start, std::min(kBlock, last - start), seen);
+        pick_block(s, points + 3 * start, std::min(kBlock, last - start), std::min(2 * kBlock, last - start), seen);
         project_block(s, static_cast<int32_t>(start), seen);
         for (size_t i = 0; i < seen.n; ++i) {
             if (seen.kind[i] == kWide) worker.wide.push_back({seen.fragment[i], seen.tiles[i]});

@@ -184,7 +184,7 @@ SF_SIMD void fill_lists(const RasterSpec& s, size_t n, int left, int top, TileSc
     const uint64_t columns = (2ull << (std::min(kTile, s.width - left) - 1)) - 1;
     for (int row = 0; row < std::min(kTile, s.height - top); ++row) t.open.add(row, columns);
     if (n == 0) return;
-    t.recent_z = t.last_z = kInfinity;
+    t.recent_z = -kInfinity, t.last_z = kInfinity;
     uint32_t begin[kBuckets + 2];
     const int buckets = bucket_by_depth(n, t, begin);
     for (int b = 0; b < buckets && t.open.any(); ++b) {
