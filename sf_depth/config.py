@@ -30,6 +30,9 @@ class DepthConfig:
     )
     nugget: float = option(0.1, "noise variance of an observation relative to the prior", low=1e-5, high=10.0)
     depth_sigma: float = option(0.03, "noise of a measured depth, m (1 sigma)", low=1e-5, high=10.0)
+    registration_sigma: float = option(
+        0.0, "how far measured depth may lie from where the image shows it, px (1 sigma)", low=0.0, high=16.0
+    )
     max_sigma: float = option(0.0, "pixels less certain than this, m, become NaN; 0 = keep all", low=0.0)
     seed: int = option(0, "seed of the observations that calibrate the variance", low=0)
     # multi-view depth (paper Sec. Depth Recovery with Dense Correlation, Depth Frame Selection)

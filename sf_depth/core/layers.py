@@ -14,11 +14,11 @@ import torch
 from sf_depth.core.conditioning import Observations
 from sf_depth.core.parallel import each
 
-_TRUST = 3.0  # a plane is extended this many spacings of its observations
+_TRUST = 6.0  # a plane is extended this many spacings of its observations; at this distance it counts half
 _CLIP = 1.3  # and changes by this factor at most
 _AGREE = 0.03  # relative deviation of planes that belong to one surface
 _SUSPECT = 1.0  # log distance behind its surroundings at which an observation counts half
-_SAMPLES = (0.25, 0.5, 0.75)  # where the colour is looked up between a pixel and an observation
+_SAMPLES = (1 / 6, 1 / 3, 1 / 2, 2 / 3, 5 / 6)  # where the colour is looked up between a pixel and an observation
 _BARRIER = 0.7  # how much a colour step in between counts against one at the ends
 _CHUNK = 8192  # observations weighed at once; fewer keep the cores waiting for the interpreter
 _SOFT = 0.25  # share of the spacing below which all observations are equally near
@@ -70,7 +70,8 @@ def at(image: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
 
 def layer(seen: Neighbourhood, reliability: torch.Tensor, spacing: torch.Tensor) -> Layer:
     """Weighted median of what the planes predict, then the average of those that agree with it."""
-    trust = seen.affinity * reliability[seen.ids][..., None]
+    reach = 1.0 / (1.0 + seen.square / (_TRUST * spacing[seen.ids][..., None]) ** 2)
+    trust = seen.affinity * reliability[seen.ids][..., None] * reach
     sharp = trust / (seen.square + 1e-3)
     ratio = _smooth(seen, _median(seen.value, sharp), trust, spacing)
     off = torch.log(seen.value / ratio[:, None])

@@ -64,11 +64,18 @@ def complete(
         log_scale, variance = regression.image(measured)
     z = np.where(measured, observed.z, base * np.exp(log_scale))
     best = sensor[measured].min()  # what the sensor gets wrong everywhere, no regression can see
-    variance = np.where(measured, sensor, np.maximum(z * z * variance, best))
+    variance = np.maximum(z * z * variance, best) + config.registration_sigma**2 * _steepness(z)
+    variance = np.where(measured, sensor, variance)
     if config.max_sigma > 0:
         unsure = variance > config.max_sigma**2
         z, variance = np.where(unsure, np.nan, z), np.where(unsure, np.nan, variance)
     return DepthMap(z, variance, observed.scale)
+
+
+def _steepness(z: Float32) -> Float32:
+    """Squared change of depth per px, [H, W] m^2: what it costs that depth lies beside where the image shows it."""
+    down, right = np.gradient(z)
+    return np.asarray(down * down + right * right)
 
 
 def _check(base: Float32 | None, observed: DepthMap, image: UInt8) -> None:

@@ -8,24 +8,54 @@ namespace {
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr size_t kBlock = 512;   // points projected at a time, into the cache
-constexpr size_t kChunk = 8192;  // points a thread takes at a time
+constexpr size_t kLanes = 16;   // of the widest vectors
+constexpr size_t kChunk = 8192;   // points a thread takes at a time
 
-struct Projected {
-    float u[kBlock], v[kBlock], z[kBlock];
-    uint32_t columns[kBlock], rows[kBlock];  // see Visible
-    int32_t visible[kBlock], wide[kBlock];   // whether it can be seen, and may cover a whole tile
+// Points of a block that may be seen, and where they lie in the image.
+struct Seen {
+    size_t n = 0;
+    int32_t row[kBlock];  // in the block
+    float point[3 * kBlock];
+    Fragment fragment[kBlock];
+    Window tiles[kBlock];
+    uint8_t kind[kBlock];  // see Kind
 };
 
-SF_SIMD void project_block(const RasterSpec& spec, const float* points, size_t n, Projected& out) {
-    const RasterSpec s = spec;  // a local copy: the compiler need not fear that `out` overlaps it
+enum Kind : uint8_t { kHidden, kNarrow, kWide };  // a wide point may cover a whole tile
+
+SF_SIMD void test_block(const RasterSpec& spec, const float* points, size_t n, uint8_t* may_show) {
+    const RasterSpec s = spec;  // a local copy: the compiler need not fear that an output overlaps it
+    const Frustum frustum(s);
+    for (size_t i = 0; i < n; ++i) may_show[i] = frustum.may_show(s, points + 3 * i);
+}
+
+// The memory is asked for the points up to `ahead` meanwhile.
+void pick_block(const RasterSpec& spec, const float* points, size_t n, size_t ahead, Seen& out) {
+    uint8_t may_show[kBlock];
+    for (size_t i = 3 * n; i < 3 * ahead; i += 64 / sizeof(float)) __builtin_prefetch(points + i);
+    test_block(spec, points, n, may_show);
+    out.n = 0;
     for (size_t i = 0; i < n; ++i) {
+        out.row[out.n] = static_cast<int32_t>(i);
+        out.n += may_show[i];
+    }
+    for (size_t k = 0; k < out.n; ++k) std::memcpy(out.point + 3 * k, points + 3 * out.row[k], 3 * sizeof(float));
+}
+
+SF_SIMD void project_block(const RasterSpec& spec, int32_t first, Seen& out) {
+    const RasterSpec s = spec;
+    const size_t whole = (out.n + kLanes - 1) / kLanes * kLanes;  // no rest that is worked through one by one
+    std::fill(out.point + 3 * out.n, out.point + 3 * whole, 0.0f);
+    std::fill(out.row + out.n, out.row + whole, 0);
+    for (size_t i = 0; i < whole; ++i) {
         Window w;
         float u, v, z;
-        out.visible[i] = sf::project(s, points + 3 * i, u, v, z, w);
-        out.u[i] = u, out.v[i] = v, out.z[i] = z;
-        out.columns[i] = static_cast<uint32_t>(w.x0 / kTile) | static_cast<uint32_t>(w.x1 / kTile) << 16;
-        out.rows[i] = static_cast<uint32_t>(w.y0 / kTile) | static_cast<uint32_t>(w.y1 / kTile) << 16;
-        out.wide[i] = (w.x1 - w.x0 >= kTile - 1) & (w.y1 - w.y0 >= kTile - 1);
+        const bool visible = sf::project(s, out.point + 3 * i, u, v, z, w);
+        const bool wide = (w.x1 - w.x0 >= kTile - 1) & (w.y1 - w.y0 >= kTile - 1);
+        out.kind[i] = visible ? (wide ? kWide : kNarrow) : kHidden;
+        out.fragment[i].u = u, out.fragment[i].v = v, out.fragment[i].z = z, out.fragment[i].id = first + out.row[i];
+        out.tiles[i].x0 = w.x0 / kTile, out.tiles[i].x1 = w.x1 / kTile;
+        out.tiles[i].y0 = w.y0 / kTile, out.tiles[i].y1 = w.y1 / kTile;
     }
 }
 
@@ -45,34 +75,14 @@ Fragment* Lots::fresh(size_t tile) {
     return pages_[lot / kPage][lot % kPage].fragments;
 }
 
-void Lots::copy_to(size_t tile, std::vector<Fragment>& out) const {
-    const Fragment* end = end_[tile];
-    for (int32_t lot = newest_[tile]; lot >= 0; lot = before_[lot]) {
-        const Fragment* first = at(lot);
-        out.insert(out.end(), first, lot == newest_[tile] ? end : first + kLot);
-    }
-}
-
 void Binner::project(const float* points, size_t first, size_t last, const RasterSpec& s, Worker& worker) const {
-    Projected p;
-    uint32_t rows[kBlock];
+    Seen seen;
     for (size_t start = first; start < last; start += kBlock) {
-        const size_t n = std::min(kBlock, last - start);
-        project_block(s, points + 3 * start, n, p);
-        size_t found = 0;
-        for (size_t i = 0; i < n; ++i) {
-            rows[found] = static_cast<uint32_t>(i);
-            found += static_cast<size_t>(p.visible[i]);
-        }
-        for (size_t k = 0; k < found; ++k) {
-            const size_t i = rows[k];
-            const Visible point{{p.u[i], p.v[i], p.z[i], static_cast<int32_t>(start + i)}, p.columns[i], p.rows[i]};
-            if (p.wide[i]) {
-                worker.wide.push_back(point);
-                continue;
-            }
-            for (int ty = point.y0(); ty <= point.y1(); ++ty)
-                for (int tx = point.x0(); tx <= point.x1(); ++tx) worker.lots.add(ty * tiles_x_ + tx, point.fragment);
+        pick_block(s, points + 3 * start, std::min(kBlock, last - start), std::min(2 * kBlock, last - start), seen);
+        project_block(s, static_cast<int32_t>(start), seen);
+        for (size_t i = 0; i < seen.n; ++i) {
+            if (seen.kind[i] == kWide) worker.wide.push_back({seen.fragment[i], seen.tiles[i]});
+            if (seen.kind[i] == kNarrow) add(seen.fragment[i], seen.tiles[i], worker.lots);
         }
     }
 }
@@ -87,8 +97,8 @@ void Binner::bound_tiles(const RasterSpec& s) {
             const float hx = half_width(s, s.fx, f.z), hy = half_width(s, s.fy, f.z);
             const int x0 = first_pixel(f.u, hx, 0), x1 = last_pixel(f.u, hx, s.width - 1);
             const int y0 = first_pixel(f.v, hy, 0), y1 = last_pixel(f.v, hy, s.height - 1);
-            for (int ty = point.y0(); ty <= point.y1(); ++ty)
-                for (int tx = point.x0(); tx <= point.x1(); ++tx) {
+            for (int ty = point.tiles.y0; ty <= point.tiles.y1; ++ty)
+                for (int tx = point.tiles.x0; tx <= point.tiles.x1; ++tx) {
                     const int left = tx * kTile, top = ty * kTile, tile = ty * tiles_x_ + tx;
                     if (x0 > left || x1 < std::min(left + kTile, s.width) - 1 || f.z >= bound_[tile]) continue;
                     if (y0 > top || y1 < std::min(top + kTile, s.height) - 1) continue;
@@ -106,8 +116,8 @@ void Binner::bound_tiles(const RasterSpec& s) {
 
 void Binner::add_wide(Worker& worker) const {
     for (const Visible& point : worker.wide)
-        for (int ty = point.y0(); ty <= point.y1(); ++ty)
-            for (int tx = point.x0(); tx <= point.x1(); ++tx) {
+        for (int ty = point.tiles.y0; ty <= point.tiles.y1; ++ty)
+            for (int tx = point.tiles.x0; tx <= point.tiles.x1; ++tx) {
                 const int tile = ty * tiles_x_ + tx;
                 if (point.fragment.z <= bound_[tile]) worker.lots.add(tile, point.fragment);
             }
@@ -127,11 +137,6 @@ void Binner::bin(const float* points, size_t n, const RasterSpec& s, int threads
     bound_tiles(s);
 #pragma omp parallel for schedule(static, 1) num_threads(threads)
     for (int i = 0; i < threads; ++i) add_wide(workers_[i]);
-}
-
-void Binner::fragments(int tile, std::vector<Fragment>& out) const {
-    out.clear();
-    for (const Worker& worker : workers_) worker.lots.copy_to(tile, out);
 }
 
 }  // namespace sf

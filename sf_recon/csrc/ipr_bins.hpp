@@ -18,12 +18,7 @@ struct Fragment {  // a visible point: continuous pixel, depth, row in the cloud
 
 struct Visible {
     Fragment fragment;
-    uint32_t columns, rows;  // of tiles, inclusive: first | last << 16
-
-    int x0() const { return columns & 0xffff; }
-    int x1() const { return columns >> 16; }
-    int y0() const { return rows & 0xffff; }
-    int y1() const { return rows >> 16; }
+    Window tiles;  // that it touches
 };
 
 // What one thread has found, by tile, in lots of equal size. Points are written once, without counting them first.
@@ -37,8 +32,21 @@ class Lots {
         *end++ = fragment;
     }
 
-    // Appends the fragments of a tile, in any order.
-    void copy_to(size_t tile, std::vector<Fragment>& out) const;
+    // Calls `take(fragments, count)` for each lot of a tile, in any order.
+    template <class F>
+    void each(size_t tile, const F& take) const {
+        for (int32_t lot = newest_[tile]; lot >= 0; lot = before_[lot]) {
+            if (before_[lot] >= 0)
+                for (size_t i = 0; i < kLot; i += 4) __builtin_prefetch(at(before_[lot]) + i);
+            take(at(lot), lot == newest_[tile] ? static_cast<size_t>(end_[tile] - at(lot)) : kLot);
+        }
+    }
+
+    size_t count(size_t tile) const {
+        size_t n = 0;
+        each(tile, [&](const Fragment*, size_t count) { n += count; });
+        return n;
+    }
 
    private:
     static constexpr size_t kLot = 64, kPage = 256;
@@ -61,7 +69,17 @@ class Binner {
     void bin(const float* points, size_t n, const RasterSpec& spec, int threads);
     int tiles_x() const { return tiles_x_; }
     int tiles() const { return tiles_x_ * tiles_y_; }
-    void fragments(int tile, std::vector<Fragment>& out) const;
+
+    size_t count(int tile) const {
+        size_t n = 0;
+        for (const Worker& worker : workers_) n += worker.lots.count(tile);
+        return n;
+    }
+
+    template <class F>
+    void each_lot(int tile, const F& take) const {
+        for (const Worker& worker : workers_) worker.lots.each(tile, take);
+    }
 
    private:
     struct Worker {  // of one thread
@@ -69,6 +87,10 @@ class Binner {
         std::vector<Visible> wide;  // set aside: each may cover a whole tile
     };
 
+    void add(const Fragment& fragment, const Window& tiles, Lots& lots) const {
+        for (int ty = tiles.y0; ty <= tiles.y1; ++ty)
+            for (int tx = tiles.x0; tx <= tiles.x1; ++tx) lots.add(ty * tiles_x_ + tx, fragment);
+    }
     void project(const float* points, size_t first, size_t last, const RasterSpec& s, Worker& worker) const;
     void bound_tiles(const RasterSpec& s);
     void add_wide(Worker& worker) const;

@@ -27,31 +27,59 @@ struct Item {  // a fragment to be sorted
 
     bool operator<(const Item& o) const { return key < o.key; }
     float z() const { return from_bits(static_cast<int32_t>(key >> 32)); }
+    uint64_t columns() const { return window & 0xffff; }
+    int y0() const { return window >> 16 & 255; }
+    int y1() const { return window >> 24; }
+};
+
+// One bit for each pixel of the tile, four rows a word; a word to spare.
+struct Pixels {
+    uint64_t word[kPixels / 64 + 1] = {};
+
+    bool any() const { return word[0] | word[1] | word[2] | word[3]; }
+    // Four rows from row y on.
+    uint64_t rows(int y) const {
+        const int shift = kTile * (y % 4);
+        return word[y / 4] >> shift | word[y / 4 + 1] << 1 << (63 - shift);
+    }
+    void add(int y, uint64_t rows) {
+        const int shift = kTile * (y % 4);
+        word[y / 4] |= rows << shift, word[y / 4 + 1] |= rows >> 1 >> (63 - shift);
+    }
+    void remove(int y, uint64_t rows) {
+        const int shift = kTile * (y % 4);
+        word[y / 4] &= ~(rows << shift), word[y / 4 + 1] &= ~(rows >> 1 >> (63 - shift));
+    }
 };
 
 struct TileScratch {
-    std::vector<Fragment> fragments;
     std::vector<uint32_t> windows;
-    std::vector<float> splats;  // [fragments, 4] u, v, z, -1 / (sigma * half-width^2) along x
+    std::vector<int32_t> ids;    // rows in the cloud
+    std::vector<float> splats;   // [fragments, 4] u, v, z, -1 / (sigma * half-width^2) along x
     std::vector<Item> items;
-    std::vector<uint32_t> list;  // [k_ray + 1, pixels] local numbers, front to back; the last row takes what is too much
+    std::vector<uint32_t> list;  // [k_ray, pixels] local numbers, front to back
     std::vector<float> weight;   // [k_ray, kTile] of one row of pixels
-    int32_t count[kPixels];
-    float last_z[kPixels];      // depth of the last point; inf before the first
-    uint64_t open[kPixels / 64];  // one bit for each pixel whose list is not complete
+    int32_t next[kPixels];       // place of the next point in `list`
+    int32_t count[kPixels];      // points of the first layer
+    Pixels open;                 // whose list takes more points
+    Pixels drawn, recent;        // that some point covers; that one covers since `recent_z`
+    float recent_z, last_z;      // depth of the last point
 
     void reserve(size_t n) {
         if (windows.size() >= n) return;
-        windows.resize(n), items.resize(n);
+        windows.resize(n), ids.resize(n), items.resize(n);
         splats.resize(4 * n);
     }
 };
 
-SF_INLINE void unpack(const RasterSpec& spec, const Fragment* fragments, size_t n, int left, int top, TileScratch& t) {
+// Fragments from number `first` on.
+SF_SIMD void unpack(const RasterSpec& spec, const Fragment* fragments, size_t n, size_t first, int left, int top,
+                    TileScratch& t) {
     const RasterSpec s = spec;
     const int right = std::min(left + kTile, s.width) - 1, bottom = std::min(top + kTile, s.height) - 1;
-    uint32_t* windows = t.windows.data();
-    float* splats = t.splats.data();
+    uint32_t* windows = t.windows.data() + first;
+    int32_t* ids = t.ids.data() + first;
+    float* splats = t.splats.data() + 4 * first;
 #pragma GCC ivdep
     for (size_t i = 0; i < n; ++i) {
         const float u = fragments[i].u, v = fragments[i].v, z = fragments[i].z;
@@ -61,71 +89,83 @@ SF_INLINE void unpack(const RasterSpec& spec, const Fragment* fragments, size_t 
         const int x0 = first_pixel(u, hx, left) - left, x1 = last_pixel(u, hx, right) - left;
         const int y0 = first_pixel(v, hy, top) - top, y1 = last_pixel(v, hy, bottom) - top;
         windows[i] = static_cast<uint32_t>((2 << x1) - (1 << x0) + (y0 << 16) + (y1 << 24));
+        ids[i] = fragments[i].id;
     }
 }
 
 // Groups the fragments by depth into buckets begin[b]..begin[b + 1], nearest first; each is sorted only when needed.
 // Returns how many buckets there are.
-SF_INLINE int bucket_by_depth(const Fragment* fragments, size_t n, TileScratch& t, uint32_t* begin) {
+SF_INLINE int bucket_by_depth(size_t n, TileScratch& t, uint32_t* begin) {
     const int buckets = n < 48 ? 16 : n < 192 ? 64 : kBuckets;
-    int32_t low = to_bits(fragments[0].z), high = low;
+    const float* z = t.splats.data() + 2;
+    int32_t low = to_bits(z[0]), high = low;
     for (size_t i = 0; i < n; ++i) {
-        const int32_t bits = to_bits(fragments[i].z);
+        const int32_t bits = to_bits(z[4 * i]);
         low = bits < low ? bits : low;
         high = bits > high ? bits : high;
     }
     int shift = 0;
     while ((high - low) >> shift >= buckets) ++shift;
     std::fill(begin, begin + buckets + 2, 0u);
-    for (size_t i = 0; i < n; ++i) ++begin[((to_bits(fragments[i].z) - low) >> shift) + 2];
+    for (size_t i = 0; i < n; ++i) ++begin[((to_bits(z[4 * i]) - low) >> shift) + 2];
     for (int b = 2; b < buckets + 2; ++b) begin[b] += begin[b - 1];
     for (size_t i = 0; i < n; ++i) {
-        const uint64_t bits = static_cast<uint64_t>(to_bits(fragments[i].z));
+        const uint64_t bits = static_cast<uint64_t>(to_bits(z[4 * i]));
         t.items[begin[((static_cast<int32_t>(bits) - low) >> shift) + 1]++] = {
-            bits << 32 | static_cast<uint32_t>(fragments[i].id), t.windows[i], static_cast<uint32_t>(i)};
+            bits << 32 | static_cast<uint32_t>(t.ids[i]), t.windows[i], static_cast<uint32_t>(i)};
     }
     return buckets;
 }
 
-// Pixels of four rows of the tile, one bit each, that a fragment covers.
-SF_INLINE uint64_t covered(const Item& item, int word) {
-    const uint64_t columns = (item.window & 0xffff) * 0x0001000100010001ull;
-    const int y0 = item.window >> 16 & 255, y1 = item.window >> 24;
-    const int first = std::max(y0 - 4 * word, 0), last = std::min(y1 - 4 * word, 3);
-    return columns & (~0ull << (16 * first)) & (~0ull >> (16 * (3 - last)));
+// Pixels that a fragment covers among the four rows from row y on, which must not lie above it.
+SF_INLINE uint64_t covered(const Item& item, int y) {
+    const int rows = std::min(item.y1() - y, 3);
+    return item.columns() * (0x0001000100010001ull >> (kTile * (3 - rows)));
 }
-
-SF_INLINE int first_word(const Item& item) { return item.window >> 18 & 63; }
-SF_INLINE int last_word(const Item& item) { return item.window >> 26; }
 
 // Leaves out the fragments that cover no open pixel; returns the end of the others.
 SF_INLINE Item* keep_open(Item* first, Item* last, const TileScratch& t) {
     Item* kept = first;
     for (; first < last; ++first) {
-        const int head = first_word(*first), tail = last_word(*first);
-        uint64_t open = (t.open[head] & covered(*first, head)) | (t.open[tail] & covered(*first, tail));
-        for (int word = head + 1; word < tail; ++word) open |= t.open[word] & covered(*first, word);
-        *kept = *first;
+        const Item item = *first;
+        uint64_t open = t.open.rows(item.y0()) & covered(item, item.y0());
+        for (int y = item.y0() + 4; y <= item.y1(); y += 4) open |= t.open.rows(y) & covered(item, y);
+        *kept = item;
         kept += open != 0;
     }
     return kept;
 }
 
+// Closes lists that a point at depth z, and all behind it, cannot join: their last point lies `gap` or more before it.
+// This saves work only, and does so after a while; resolve8 finds where a layer ends.
+SF_INLINE void end_layers(float z, float gap, TileScratch& t) {
+    const bool all = z - t.last_z >= gap;
+    for (int i = 0; i < kPixels / 64; ++i) {
+        t.open.word[i] &= ~(all ? t.drawn.word[i] | t.recent.word[i] : t.drawn.word[i] & ~t.recent.word[i]);
+        t.drawn.word[i] |= t.recent.word[i];
+        t.recent.word[i] = 0;
+    }
+    t.recent_z = z;
+}
+
 // One fragment into the lists of the pixels it covers that are still open.
-SF_INLINE void draw(const Item& item, int k, float gap, TileScratch& t) {
+SF_INLINE void draw(const Item& item, int end, float gap, TileScratch& t) {
     const float z = item.z();
+    if (!(z - t.recent_z < gap)) end_layers(z, gap, t);
+    t.last_z = z;
     uint32_t* list = t.list.data();
-    for (int word = first_word(item); word <= last_word(item); ++word) {
+    for (int y = item.y0(); y <= item.y1(); y += 4) {
+        const uint64_t taken = t.open.rows(y) & covered(item, y);
         uint64_t complete = 0;
-        for (uint64_t bits = t.open[word] & covered(item, word); bits; bits &= bits - 1) {
-            const int bit = __builtin_ctzll(bits), p = 64 * word + bit, count = t.count[p];
-            const int taken = z - t.last_z[p] < gap;
-            list[count * kPixels + p] = item.local;
-            t.count[p] = count + taken;
-            t.last_z[p] = z;
-            complete |= static_cast<uint64_t>(!taken | (count + 1 >= k)) << bit;
+        int32_t* next = t.next + kTile * y;
+        for (uint64_t bits = taken; bits; bits &= bits - 1) {
+            const int bit = __builtin_ctzll(bits), place = next[bit];
+            list[place] = item.local;
+            next[bit] = place + kPixels;
+            complete |= static_cast<uint64_t>(place + kPixels >= end) << bit;
         }
-        t.open[word] &= ~complete;
+        t.recent.add(y, taken);
+        t.open.remove(y, complete);
     }
 }
 
@@ -138,27 +178,23 @@ void insertion_sort(Item* first, Item* last) {
     }
 }
 
-SF_SIMD void fill_lists(const RasterSpec& s, const Fragment* fragments, size_t n, int left, int top, TileScratch& t) {
-    std::fill(t.count, t.count + kPixels, 0);
-    std::fill(t.last_z, t.last_z + kPixels, kInfinity);
+SF_SIMD void fill_lists(const RasterSpec& s, size_t n, int left, int top, TileScratch& t) {
+    for (int p = 0; p < kPixels; ++p) t.next[p] = p;
+    t.open = t.drawn = t.recent = Pixels();
     const uint64_t columns = (2ull << (std::min(kTile, s.width - left) - 1)) - 1;
-    for (int row = 0; row < kTile; ++row) {
-        const uint64_t open = row < s.height - top ? columns : 0;
-        t.open[row / 4] = row % 4 ? t.open[row / 4] | open << (16 * (row % 4)) : open;
-    }
+    for (int row = 0; row < std::min(kTile, s.height - top); ++row) t.open.add(row, columns);
     if (n == 0) return;
-    t.reserve(n);
-    unpack(s, fragments, n, left, top, t);
+    t.recent_z = -kInfinity, t.last_z = kInfinity;
     uint32_t begin[kBuckets + 2];
-    const int buckets = bucket_by_depth(fragments, n, t, begin);
-    for (int b = 0; b < buckets && (t.open[0] | t.open[1] | t.open[2] | t.open[3]); ++b) {
+    const int buckets = bucket_by_depth(n, t, begin);
+    for (int b = 0; b < buckets && t.open.any(); ++b) {
         Item *first = t.items.data() + begin[b], *last = t.items.data() + begin[b + 1];
         if (last - first > 1) last = keep_open(first, last, t);
         if (last - first > 24)
             std::sort(first, last);
         else if (last - first > 1)
             insertion_sort(first, last);
-        for (; first < last; ++first) draw(*first, s.k_ray, s.layer_gap, t);
+        for (; first < last; ++first) draw(*first, s.k_ray * kPixels, s.layer_gap, t);
     }
 }
 
@@ -168,17 +204,21 @@ struct RowMeans {  // over the first layer of one row of pixels; `weight` is wha
 
 // Weighted means of the first layer for eight pixels of a row; `t.weight` keeps the weights before normalisation.
 SF_INLINE void resolve8(const RasterSpec& s, float u, float v, int pixel, TileScratch& t, RowMeans& out) {
-    const Int8 count = *reinterpret_cast<const Int8*>(t.count + pixel);
+    const Int8 filled = *reinterpret_cast<const Int8*>(t.next + pixel) / kPixels;
     const Float8 centre = Float8{0, 1, 2, 3, 4, 5, 6, 7} + u;
     const bool square = s.fx == s.fy;
-    const int most = *std::max_element(t.count + pixel, t.count + pixel + 8), column = pixel % kTile;
-    Float8 sum_w{}, sum_x{}, sum_y{}, sum_z{};
+    const int most = *std::max_element(t.next + pixel, t.next + pixel + 8) / kPixels, column = pixel % kTile;
+    Float8 sum_w{}, sum_x{}, sum_y{}, sum_z{}, last_z = Float8{} + kInfinity;
+    Int8 count{}, used = count == 0;
     for (int c = 0; c < most; ++c) {
-        const Int8 used = count > c;
-        const Int8 rows = 4 * *reinterpret_cast<const Int8*>(t.list.data() + c * kPixels + pixel) & used;
+        const Int8 there = filled > c;
+        const Int8 rows = 4 * *reinterpret_cast<const Int8*>(t.list.data() + c * kPixels + pixel) & there;
         Float8 splat[4];  // u, v, z, -1 / (sigma * half-width^2)
         gather8x4(t.splats.data(), rows, splat);
         const Float8 z = splat[2];
+        used &= there & (z - last_z < s.layer_gap);
+        count -= used;
+        last_z = z;
         Float8 per_y2 = splat[3];
         if (!square) {
             Float8 half = s.radius * s.fy / z;
@@ -196,6 +236,7 @@ SF_INLINE void resolve8(const RasterSpec& s, float u, float v, int pixel, TileSc
         sum_x += wz * (splat[0] - s.cx);
         sum_y += wz * (splat[1] - s.cy);
     }
+    std::memcpy(t.count + pixel, &count, sizeof(count));
     const Float8 scale = count > 0 ? 1.0f / sum_w : Float8{} + kHole;
     const Float8 means[4] = {sum_x * scale / s.fx, sum_y * scale / s.fy, sum_z * scale, scale};
     std::memcpy(out.x + column, &means[0], 32), std::memcpy(out.y + column, &means[1], 32);
@@ -209,25 +250,26 @@ SF_SIMD void resolve_row(const RasterSpec& spec, int left, int row, int v, TileS
 }
 
 // Mean of the points' normals, each turned towards the camera.
-void blend_normals(const RasterSpec& s, const float* normals, const Fragment* fragments, const TileScratch& t,
+void blend_normals(const RasterSpec& s, const float* normals, const TileScratch& t,
                    int pixel, float* out) {
     const float* R = s.rotation;
     float sum[3] = {0.0f, 0.0f, 0.0f}, total = 0.0f;
     for (int c = 0; c < t.count[pixel]; ++c) {
-        const Fragment& f = fragments[t.list[c * kPixels + pixel]];
-        const float* n = normals + 3 * static_cast<size_t>(f.id);
+        const size_t local = t.list[c * kPixels + pixel];
+        const float* splat = t.splats.data() + 4 * local;
+        const float* n = normals + 3 * static_cast<size_t>(t.ids[local]);
         const float weight = t.weight[c * kTile + pixel % kTile];
         total += weight;
         float m[3];
         for (int a = 0; a < 3; ++a) m[a] = R[3 * a] * n[0] + R[3 * a + 1] * n[1] + R[3 * a + 2] * n[2];
-        const float along = m[0] * (f.u - s.cx) / s.fx + m[1] * (f.v - s.cy) / s.fy + m[2];
+        const float along = m[0] * (splat[0] - s.cx) / s.fx + m[1] * (splat[1] - s.cy) / s.fy + m[2];
         for (int a = 0; a < 3; ++a) sum[a] += (along > 0.0f ? -weight : weight) * m[a];
     }
     const float norm = norm_of(sum);
     for (int a = 0; a < 3; ++a) out[a] = norm > 1e-6f * total && total > 0.0f ? sum[a] / norm : kHole;
 }
 
-void write_row(const RasterSpec& s, const float* normals, const Fragment* fragments, int row, size_t at, int width,
+void write_row(const RasterSpec& s, const float* normals, int row, size_t at, int width,
                const TileScratch& t, const RowMeans& means, const RasterImages& out) {
     std::copy(means.z, means.z + width, out.depth + at);
     for (int i = 0; i < width && out.position; ++i) {
@@ -239,24 +281,28 @@ void write_row(const RasterSpec& s, const float* normals, const Fragment* fragme
         const size_t count = t.count[row * kTile + i];
         const uint32_t* list = t.list.data() + row * kTile + i;
         for (size_t c = 0; c < k && out.index; ++c)
-            out.index[(at + i) * k + c] = c < count ? fragments[list[c * kPixels]].id : -1;
+            out.index[(at + i) * k + c] = c < count ? t.ids[list[c * kPixels]] : -1;
         for (size_t c = 0; c < k && out.weight; ++c)
             out.weight[(at + i) * k + c] = c < count ? t.weight[c * kTile + i] * means.weight[i] : 0.0f;
     }
     for (int i = 0; i < width && out.normal && normals; ++i)
-        blend_normals(s, normals, fragments, t, row * kTile + i, out.normal + 3 * (at + i));
+        blend_normals(s, normals, t, row * kTile + i, out.normal + 3 * (at + i));
 }
 
 void draw_tile(const RasterSpec& s, const float* normals, const Binner& bins, int tile, TileScratch& t,
                const RasterImages& out) {
     const int left = tile % bins.tiles_x() * kTile, top = tile / bins.tiles_x() * kTile;
-    bins.fragments(tile, t.fragments);
-    const Fragment* fragments = t.fragments.data();
-    fill_lists(s, fragments, t.fragments.size(), left, top, t);
+    t.reserve(bins.count(tile));
+    size_t n = 0;
+    bins.each_lot(tile, [&](const Fragment* fragments, size_t count) {
+        unpack(s, fragments, count, n, left, top, t);
+        n += count;
+    });
+    fill_lists(s, n, left, top, t);
     for (int v = top; v < std::min(top + kTile, s.height); ++v) {
         RowMeans sums;
         resolve_row(s, left, v - top, v, t, sums);
-        write_row(s, normals, fragments, v - top, static_cast<size_t>(v) * s.width + left,
+        write_row(s, normals, v - top, static_cast<size_t>(v) * s.width + left,
                   std::min(kTile, s.width - left), t, sums, out);
     }
 }
@@ -277,7 +323,7 @@ void rasterize(const float* points, const float* normals, size_t n, const Raster
 #pragma omp parallel num_threads(threads)
     {
         TileScratch scratch;
-        scratch.list.resize(static_cast<size_t>(s.k_ray + 1) * kPixels);
+        scratch.list.resize(static_cast<size_t>(s.k_ray) * kPixels);
         scratch.weight.resize(static_cast<size_t>(s.k_ray) * kTile);
 #pragma omp for schedule(dynamic, 8)
         for (int tile = 0; tile < bins.tiles(); ++tile) draw_tile(s, normals, bins, tile, scratch, out);

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // The pixels that a point covers: the same arithmetic, step by step, for all siblings of the rasteriser.
 #pragma once
+#include <cmath>
+
 #include "ipr_cpu.hpp"
 
 #ifdef __CUDACC__
@@ -35,6 +37,27 @@ SF_ANYWHERE int last_pixel(float centre, float half, int high) {
 
 struct Window {  // inclusive; empty when the point is not visible
     int x0, x1, y0, y1;
+};
+
+// False when a point touches no pixel for certain: a cheap test without a division. The bounds are wider than those of
+// project() by more than rounding can do.
+struct Frustum {
+    float left, right, top, bottom;  // bounds of x / z and y / z, times the focal length
+
+    explicit Frustum(const RasterSpec& s) {
+        const float margin = s.max_half + 1.0f;
+        const float slack = margin + 1.0f + 1e-5f * (std::abs(s.cx) + std::abs(s.cy) + s.width + s.height);
+        left = -s.cx - slack, right = s.width - s.cx + slack;
+        top = -s.cy - slack, bottom = s.height - s.cy + slack;
+    }
+
+    SF_ANYWHERE bool may_show(const RasterSpec& s, const float* p) const {
+        const float* R = s.rotation;
+        const float x = s.fx * (R[0] * p[0] + R[1] * p[1] + R[2] * p[2] + s.translation[0]);
+        const float y = s.fy * (R[3] * p[0] + R[4] * p[1] + R[5] * p[2] + s.translation[1]);
+        const float z = R[6] * p[0] + R[7] * p[1] + R[8] * p[2] + s.translation[2];
+        return (z >= s.near) & (x > left * z) & (x < right * z) & (y > top * z) & (y < bottom * z);
+    }
 };
 
 // Continuous pixel and depth of a point, and its window in the image; false when it touches no pixel.
