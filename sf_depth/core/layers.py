@@ -31,7 +31,7 @@ class Neighbourhood:
     ids: torch.Tensor  # [B, K]
     value: torch.Tensor  # [B, K, M] ratio that each observation's plane predicts
     square: torch.Tensor  # [B, K, M] px^2, distance
-    affinity: torch.Tensor  # [B, K, M] (0, 1], alike in colour
+    affinity: torch.Tensor  # [B, K, M] (0, 1], alike in colour and within reach
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,8 @@ def look(observed: Observations, ids: torch.Tensor, x: torch.Tensor, color: torc
     square = dx * dx + dy * dy
     slope, spacing, ratio = observed.slope[ids], observed.spacing[ids], observed.ratio[ids][..., None]
     rise = dx * slope[..., :1] + dy * slope[..., 1:]
-    rise *= torch.rsqrt((square / (_TRUST * spacing[..., None]) ** 2).clamp_min_(1.0))
+    reach = square * (1.0 / (_TRUST * spacing[..., None]) ** 2)
+    rise *= torch.rsqrt(reach.clamp_min(1.0))
     value = torch.minimum(torch.maximum(ratio + rise, ratio / _CLIP), ratio * _CLIP)
     own, there = at(color, x), at(color, seen)
     step = torch.zeros_like(spacing)
@@ -60,7 +61,8 @@ def look(observed: Observations, ids: torch.Tensor, x: torch.Tensor, color: torc
         step = torch.maximum(step, ((between - there) ** 2).sum(dim=2))
     off = (own * own).sum(2)[:, None] + (there * there).sum(2)[..., None] - 2.0 * there @ own.transpose(1, 2)
     off = torch.maximum(off, _BARRIER * step[..., None])
-    return Neighbourhood(ids, value, square, 1.0 / (1.0 + off))
+    affinity = off.add_(1.0).mul_(reach.add_(1.0)).reciprocal_()
+    return Neighbourhood(ids, value, square, affinity)
 
 
 def at(image: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
@@ -70,8 +72,7 @@ def at(image: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
 
 def layer(seen: Neighbourhood, reliability: torch.Tensor, spacing: torch.Tensor) -> Layer:
     """Weighted median of what the planes predict, then the average of those that agree with it."""
-    reach = 1.0 / (1.0 + seen.square / (_TRUST * spacing[seen.ids][..., None]) ** 2)
-    trust = seen.affinity * reliability[seen.ids][..., None] * reach
+    trust = seen.affinity * reliability[seen.ids][..., None]
     sharp = trust / (seen.square + 1e-3)
     ratio = _smooth(seen, _median(seen.value, sharp), trust, spacing)
     off = torch.log(seen.value / ratio[:, None])
