@@ -19,14 +19,14 @@ from sf_depth.core.matching import pixel_grid
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Float32, Float64, Keyframe
 
-_ALIKE = 0.015  # relative difference of inverse depths that show one surface, at least
-_ALIKE_PX = 0.5  # or so much of the sweep's disparity
-_MOST_ALIKE = 0.05  # but no more than this
+_ALIKE, _MOST_ALIKE = 0.015, 0.05  # relative difference of inverse depths that show one surface, at least and at most
+_ALIKE_NOISE = 3.5  # in between so many times what keyframes typically disagree by
+_SAME = 0.1  # relative difference of inverse depths of what may be one surface at all
 _MIN_Z = 0.05  # of the own depth; nearer to another camera nothing is compared
-# Measured against exact depth: a point that one other keyframe confirms errs by so many px of disparity (1 sigma), one
-# that n confirm by an n-th of it; each that sees through it makes it less sure. Poses err too.
-_SIGMA_PX, _DENIED = 0.8, 0.7
-_POSES = 0.003  # relative
+# Measured against exact and sensor depth, in units of what keyframes typically disagree by: a point that one other
+# keyframe confirms errs by so much (1 sigma), one that n confirm by an n-th of it, as far as poses are right; each that
+# sees through it makes it less sure. What poses get wrong all keyframes may share.
+_SIGMA, _DENIED, _SHARED = 5.0, 0.7, 0.8
 _CONTINUOUS = 0.02  # relative difference within one surface: there depth is interpolated
 
 
@@ -57,36 +57,52 @@ class Swept:
 
 
 @dataclass(frozen=True, slots=True)
-class _Witness:
-    """What one keyframe says about another's points, [N]: their inverse depth, as far as it confirms or denies them."""
+class _Said:
+    """What one keyframe says about another's points, [N].
+
+    Args:
+        d: inverse depth of what it sees in their place, on their rays.
+        apart: relative difference of what it sees from what it should see there; NaN where it does not look.
+    """
 
     d: Float32
-    confirms: np.ndarray
-    denies: np.ndarray
+    apart: Float32
 
 
 def confirmed(own: Swept, others: Sequence[Swept]) -> DepthMap:
     """Depth with variance of the full image, NaN where no other keyframe confirms it."""
-    shape = own.d.shape
-    d = own.d.reshape(-1)
+    shape, size = own.d.shape, (own.keyframe.camera.width, own.keyframe.camera.height)
     x = pinhole.rays(own.theta, np.ascontiguousarray(pixel_grid(shape).reshape(-1, 2).T)).astype(np.float32)
-    alike = np.clip(_ALIKE_PX / own.disparity.reshape(-1), _ALIKE, _MOST_ALIKE)
-    total, count, denied = d.copy(), np.zeros_like(d), np.zeros_like(d)
-    for other in others:
-        said = _witness(own, other, x, alike)
-        total += np.where(said.confirms, said.d, np.float32(0))
-        count += said.confirms
-        denied += said.denies
-    d = np.where(count > denied, total / (count + 1), np.float32(np.nan)).reshape(shape)
-    sigma = _SIGMA_PX * (1 + _DENIED * denied) / np.maximum(count, 1)  # px of disparity
-    relative = np.hypot(sigma.reshape(shape) / own.disparity, np.float32(_POSES))
-    size = own.keyframe.camera.width, own.keyframe.camera.height
-    z = 1.0 / _enlarged(d, size)
-    variance = (z * cv2.resize(relative, size, interpolation=cv2.INTER_NEAREST)) ** 2
-    return DepthMap(z, np.where(np.isfinite(z), variance, np.float32(np.nan)), own.keyframe.scale)
+    said = [_asked(own, other, x) for other in others]
+    own_d, disparity = own.d.reshape(-1), own.disparity.reshape(-1)
+    noise, noise_px = _disagreement(said, disparity)
+    alike = np.clip(_ALIKE_NOISE * noise_px / disparity, _ALIKE, _MOST_ALIKE)
+    total, count, denied = own_d.copy(), np.zeros_like(own_d), np.zeros_like(own_d)
+    for one in said:
+        confirms = np.abs(one.apart) < alike
+        total += np.where(confirms, one.d, np.float32(0))
+        count += confirms
+        denied += one.apart < -alike
+    d = np.where(count > denied, total / (count + 1), np.float32(np.nan))
+    sigma = _SIGMA * noise_px * (1 + _DENIED * denied) / np.maximum(count, 1) / disparity
+    relative = np.hypot(sigma, _SHARED * noise).astype(np.float32)
+    z = 1.0 / _enlarged(d.reshape(shape), size)
+    variance = (z * cv2.resize(relative.reshape(shape), size, interpolation=cv2.INTER_NEAREST)) ** 2
+    return DepthMap(z, variance, own.keyframe.scale)
 
 
-def _witness(own: Swept, other: Swept, x: Float32, alike: Float32) -> _Witness:
+def _disagreement(said: Sequence[_Said], disparity: Float32) -> tuple[float, float]:
+    """What keyframes typically disagree by about one surface: relative, and in px of disparity [N]."""
+    apart = [np.abs(one.apart) for one in said]
+    same = [a < _SAME for a in apart]
+    if not any(s.any() for s in same):
+        return _SAME, float(np.median(_SAME * disparity))
+    relative = np.concatenate([a[s] for a, s in zip(apart, same, strict=True)])
+    px = np.concatenate([(a * disparity)[s] for a, s in zip(apart, same, strict=True)])
+    return float(np.median(relative)), float(np.median(px))
+
+
+def _asked(own: Swept, other: Swept, x: Float32) -> _Said:
     """What ``other`` says about the points on the rays x [2, N] of ``own``."""
     d = own.d.reshape(-1)
     T = (se3.inverse(other.keyframe.T_map_camera) @ own.keyframe.T_map_camera).astype(np.float32)
@@ -97,16 +113,11 @@ def _witness(own: Swept, other: Swept, x: Float32, alike: Float32) -> _Witness:
     height, width = other.d.shape
     inside = (X[2] > _MIN_Z) & (col >= 0) & (col < width) & (row >= 0) & (row < height)
     theirs = np.where(inside, other.d[row.clip(0, height - 1), col.clip(0, width - 1)], np.float32(1))
-    apart = np.log(theirs * ahead / d)
-    # Their point on our ray: its depth here is Z / theirs.
-    Z = T[:3, 2] @ np.concatenate([y, np.ones_like(y[:1])]) + _backward(T) * theirs
-    confirms = inside & (np.abs(apart) < alike) & (Z > _MIN_Z)
-    return _Witness(theirs / np.maximum(Z, np.float32(_MIN_Z)), confirms, inside & (apart < -alike))
-
-
-def _backward(T: Float32) -> np.float32:
-    """The depth coordinate of the translation of the inverse of T."""
-    return np.float32(-(T[:3, 2] @ T[:3, 3]))
+    # The depth of their point in our camera, in units of theirs.
+    back = T[:2, 2] @ y + T[2, 2] - (T[:3, 2] @ T[:3, 3]) * theirs
+    inside &= back > _MIN_Z
+    apart = np.where(inside, np.log(theirs * ahead / d), np.float32(np.nan))
+    return _Said(theirs / np.maximum(back, np.float32(_MIN_Z)), apart)
 
 
 def _enlarged(d: Float32, size: tuple[int, int]) -> Float32:
