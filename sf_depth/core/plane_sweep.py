@@ -34,30 +34,30 @@ EDGE = 8.0  # grey levels at which a break costs half
 MIN_Z = 0.05  # of the reference depth
 
 
-def sweep_planes(reference: UInt8, sources: Sequence[UInt8], at: Estimate) -> Float32:
-    """Inverse depth [H / 4, W / 4] of a reference image.
+def sweep_planes(reference: UInt8, sources: Sequence[UInt8], at: Estimate, reduction: int = REDUCTION) -> Float32:
+    """Inverse depth [H / reduction, W / reduction] of a reference image.
 
     Args:
         sources: the images that ``at.T`` places.
         at: geometry so far; its inverse depths give the range of the sweep.
     """
-    height, width = reference.shape[0] // REDUCTION, reference.shape[1] // REDUCTION
+    height, width = reference.shape[0] // reduction, reference.shape[1] // reduction
     size = (width, height)
     first, *others = (
         cv2.resize(grey(image), size, interpolation=cv2.INTER_AREA).astype(np.float32)
         for image in (reference, *sources)
     )
-    planes = _planes(at)
+    planes = _planes(at, reduction)
     part = Compared(first, others, at, reference.shape[1] / width, reference.shape[0] / height)
     cost = np.stack(each(part.dissimilarity, planes), axis=2)  # [h, w, D]
     return _winner(_aggregated(cost, cv2.GaussianBlur(first, (0, 0), 0.7)), planes)
 
 
-def _planes(at: Estimate) -> Float32:
+def _planes(at: Estimate, reduction: int) -> Float32:
     """Inverse depths that are evenly spaced in the image, [D]."""
     median, low, high = np.quantile(at.inverse_depth, [0.5, 0.01, 0.99])
     nearest, farthest = max(_NEAREST[0] * high, _NEAREST[1] * median), max(_FARTHEST * low, 1e-3 * median)
-    moved = at.theta[0] / REDUCTION * np.linalg.norm(at.T[:, :3, 3], axis=1).max() * (nearest - farthest)
+    moved = at.theta[0] / reduction * np.linalg.norm(at.T[:, :3, 3], axis=1).max() * (nearest - farthest)
     return np.linspace(farthest, nearest, int(np.clip(moved / _STEP, _FEWEST, _MOST)), dtype=np.float32)
 
 

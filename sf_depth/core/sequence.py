@@ -1,7 +1,8 @@
 """Depth of the keyframes of a sequence (modes ``slam`` and ``posed``).
 
-A keyframe waits until frames after it have come too; then its good neighbours are chosen, U2-MVD runs on them,
-and the tracker's landmarks (slam) or the given poses (posed) bring its depth to the global scale.
+A keyframe waits until frames after it have come too; then its good neighbours are chosen. With given poses, which may
+contradict the images, U2-MVD runs on them (posed); with the tracker's a sweep, whose depth waits until that of
+others confirms it (slam). What neither knows is completed.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -15,17 +16,18 @@ import numpy as np
 from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.filling import Filler
-from sf_depth.core.mvd import CONTRADICTED, MultiViewDepth, Recovered
+from sf_depth.core.mvd import CONTRADICTED, MultiViewDepth
 from sf_depth.core.neighbors import NeighborLimits, before_and_after
 from sf_depth.core.overlap import sighted_depth
-from sf_depth.core.scale import GlobalScale, from_landmarks, in_unit
+from sf_depth.core.swept import Consensus, relative, swept
 from sf_interfaces.errors import SceneFactoryError
 from sf_interfaces.geometry import se3
-from sf_interfaces.types import DepthMap, Float64, Keyframe
+from sf_interfaces.types import Keyframe
 
 _AHEAD = 6  # later frames a keyframe waits for
 _KEPT = 24  # frames that may still become neighbours
 _LEAST_NEIGHBORS = 2  # tau_nb of the paper
+_LEAST_DENSITY = 0.01  # share of the pixels whose depth has to be known before gaps are filled
 _NOTHING_MEASURED = "keyframe without measured depth, as between the sweeps of a LiDAR"
 
 
@@ -38,22 +40,22 @@ class Setting(Protocol):
     def scene_depth(self, frame: Keyframe, others: list[Keyframe]) -> float | None:
         """Typical depth that a frame sees, in the unit of its pose; None while unknown."""
 
-    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[Recovered, GlobalScale]:
-        """Depth, and what brings it to the global scale.
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[list[Keyframe], bool]:
+        """Keyframes that have depth now, with gaps, and whether the poses of this one contradict its images.
 
         Raises:
-            InsufficientParallax: the neighbours do not constrain it.
+            InsufficientParallax: the neighbours do not constrain the depth of this one.
         """
 
-
-def _relative(frame: Keyframe, sources: list[Keyframe]) -> Float64:
-    """T_source_reference [S, 4, 4] by the poses of the keyframes."""
-    return np.stack([se3.inverse(source.T_map_camera) @ frame.T_map_camera for source in sources])
+    def finish(self) -> list[Keyframe]:
+        """The end of the sequence: the keyframes that still waited, with depth."""
 
 
-@dataclass(frozen=True, slots=True)
 class SlamSetting:
-    """Every keyframe of the tracker gets depth; poses only choose neighbours, landmarks give the scale."""
+    """Every keyframe of the tracker gets depth, by a sweep at its pose that other keyframes confirm."""
+
+    def __init__(self) -> None:
+        self._consensus = Consensus()
 
     def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
         """Always: the tracker has chosen."""
@@ -66,11 +68,13 @@ class SlamSetting:
         z = frame.landmarks.points[:, 2]
         return float(np.median(z[z > 0])) if (z > 0).any() else None
 
-    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[Recovered, GlobalScale]:
-        """Unposed depth and the scale of the landmarks."""
-        got = mvd.recover(frame.image, [s.image for s in sources], frame.camera)
-        assert frame.landmarks is not None
-        return got, from_landmarks(got.depth.z, frame.landmarks.points.astype(np.float64), frame.camera)
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[list[Keyframe], bool]:
+        """Sweep this one; those before it that have been asked about now."""
+        return self._consensus.add(swept(frame, sources)), False
+
+    def finish(self) -> list[Keyframe]:
+        """Those for which no more witnesses come."""
+        return self._consensus.finish()
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,10 +95,15 @@ class PosedSetting:
         """Median depth of sparse matches, triangulated with the given poses."""
         return sighted_depth(frame, others)
 
-    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[Recovered, GlobalScale]:
+    def recover(self, mvd: MultiViewDepth, frame: Keyframe, sources: list[Keyframe]) -> tuple[list[Keyframe], bool]:
         """Depth with the given poses; where they fit the images badly, their translations only give the scale."""
-        T = _relative(frame, sources)
-        return mvd.recover(frame.image, [s.image for s in sources], frame.camera, T), GlobalScale(1.0, 0.0)
+        got = mvd.recover(frame.image, [s.image for s in sources], frame.camera, relative(frame, sources))
+        depth = replace(got.depth, scale=frame.depth.scale) if frame.depth else got.depth
+        return [replace(frame, depth=depth)], got.contradicted
+
+    def finish(self) -> list[Keyframe]:
+        """Nothing waits."""
+        return []
 
 
 class EachDepth:
@@ -114,12 +123,6 @@ class EachDepth:
     def finish(self) -> list[Keyframe]:
         """Nothing waits."""
         return []
-
-
-def scaled(depth: DepthMap, scale: GlobalScale, frame: Keyframe) -> DepthMap:
-    """Depth in the unit of the keyframe's pose; what is not sure about its scale is in the variance."""
-    own = in_unit(depth, scale)
-    return replace(own, scale=frame.depth.scale) if frame.depth else own
 
 
 class SequenceDepth:
@@ -157,7 +160,7 @@ class SequenceDepth:
         while self._next < len(self._frames):
             done += self._consider()
         self._frames, self._next, self._last, self._depth = [], 0, None, 0.0
-        return done
+        return done + self._filled(self._setting.finish())
 
     def _consider(self) -> list[Keyframe]:
         """Depth of the next frame, if it is to be a keyframe and its neighbours allow it."""
@@ -176,14 +179,27 @@ class SequenceDepth:
         if len(chosen) < _LEAST_NEIGHBORS:
             return self._skip("too few good neighbours: the camera hardly moves, or turns too fast")
         try:
-            got, scale = self._setting.recover(self._mvd, frame, [self._frames[j] for j in chosen])
-            dense = self._filler.fill(replace(frame, depth=scaled(got.depth, scale, frame)))
+            found, contradicted = self._setting.recover(self._mvd, frame, [self._frames[j] for j in chosen])
         except SceneFactoryError as error:
             return self._skip(str(error))
-        if got.contradicted:
+        if contradicted:
             self._count(CONTRADICTED)
         self._last = frame
-        return [dense]
+        return self._filled(found)
+
+    def _filled(self, found: list[Keyframe]) -> list[Keyframe]:
+        """Keyframes without gaps; those that know too little to fill them are left out."""
+        done: list[Keyframe] = []
+        for keyframe in found:
+            density = 0.0 if keyframe.depth is None else keyframe.depth.density
+            if density < _LEAST_DENSITY:
+                self._skip(f"other keyframes confirm {density:.1%} of its depth; it takes more parallax and overlap")
+                continue
+            try:
+                done.append(self._filler.fill(keyframe))
+            except SceneFactoryError as error:
+                self._skip(str(error))
+        return done
 
     def _skip(self, reason: str) -> list[Keyframe]:
         self._count(f"keyframe without depth: {reason}")
