@@ -1,6 +1,7 @@
 """Rooms like Replica's, RGB-D and mono: tracking, surface and views off and on the path, beside the paper's rows.
 
     python benchmarks/rooms.py [--rooms room0 office0] [--frames 40] [--stride 3] [--factor 0.25] [--out bench]
+    python benchmarks/rooms.py --tracking --rooms ... --frames 400 --stride 5 --factor 0.5: whole walks, poses alone
 
 The surface is scored where a view saw it, from samples to triangles, and between samples by NICE's protocol (culled
 by frusta) and NICER's (not culled). Our rooms have furniture with hidden insides, which a frustum does not leave out
@@ -11,6 +12,7 @@ beside RGB-D.
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,10 +23,14 @@ from lines import LINES, derive
 from paper import PAPER
 
 from sf_bringup import measures
+from sf_bringup.evaluation import trajectory_error
 from sf_bringup.evaluation.image import Lpips
 from sf_bringup.run_folder import RunFolder
-from sf_bringup.simulate import PRESETS
+from sf_bringup.simulate import PRESETS, SimulationSpec, Simulator
 from sf_interfaces.errors import SceneFactoryError
+from sf_interfaces.types import DepthMap, Float64, Frame, Trajectory
+from sf_tracking.config import TrackingConfig
+from sf_tracking.core.session import TrackingSession
 
 
 def score(run: RunFolder, mesh: Path) -> dict[str, Any]:
@@ -79,6 +85,39 @@ def depth_alone(bag: Path, out: Path) -> float:
     return 100 * measures.measure_trajectory(run).rmse
 
 
+def track(spec: SimulationSpec, kinds: Sequence[str]) -> dict[str, Any]:
+    """ATE in cm of a walk that is tracked while it is rendered, and keeps no image."""
+    simulator = Simulator(spec)
+    sessions = {kind: TrackingSession(TrackingConfig()) for kind in kinds}
+    true: list[tuple[int, Float64]] = []
+    for index in range(spec.frames):
+        image, z, T = simulator.frame(index)
+        true.append((round((index + 1) * 1e9 / spec.fps), T))
+        for kind, session in sessions.items():
+            depth = DepthMap(z) if kind == "rgbd" else None
+            session.track(Frame(true[-1][0], spec.camera, image, depth))
+    cells: dict[str, Any] = {}
+    for kind, session in sessions.items():
+        session.finish()
+        error = trajectory_error(
+            session.trajectory(), Trajectory.from_pairs(true), alignment="se3" if kind == "rgbd" else "sim3"
+        )
+        cells |= {f"{kind} ATE cm": 100 * error.rmse, f"{kind} RPE mm": 1e3 * error.rpe_rmse}
+        cells[f"{kind} tracked"] = f"{error.pairs}/{spec.frames}"
+    return {**cells, "path m": error.path_length}
+
+
+def track_all(bench: Benchmark, specs: dict[str, SimulationSpec], kinds: Sequence[str]) -> None:
+    """Whole walks beside the paper's trajectories."""
+    rows: list[dict[str, Any]] = []
+    for room, spec in specs.items():
+        rows.append({"room": room, **track(spec, kinds)})
+        print_rows(rows[-1:])
+    rows.append(mean_row(rows, room="mean"))
+    print_rows(rows[-1:])
+    bench.write("Walks through rooms like Replica's, tracked", {"walks": rows})
+
+
 def main() -> None:
     bench = Benchmark("rooms", __doc__.splitlines()[0])
     bench.parser.add_argument("--rooms", nargs="+", default=["room0", "office0"], choices=paper.ROOMS)
@@ -86,19 +125,25 @@ def main() -> None:
     bench.parser.add_argument("--frames", type=int, default=40)
     bench.parser.add_argument("--stride", type=int, default=3, help="take every n-th frame of 30 a second")
     bench.parser.add_argument("--factor", type=float, default=0.25, help="of Replica's 1200x680 pixels")
+    bench.parser.add_argument("--tracking", action="store_true", help="poses alone, frame by frame")
     args = bench.parse()
+    specs = {
+        room: replace(shrunk(PRESETS[room], args.frames, args.stride, args.factor), depth="exact", novel_views=8)
+        for room in args.rooms
+    }
     bench.note(
         f"{args.frames} frames, every {args.stride}., at {args.factor} of 1200x680: simulated rooms with exact depth. "
         "Paper rows are for Replica's scans at full length and size on a GPU."
     )
+    if args.tracking:
+        return track_all(bench, specs, args.inputs)
     try:
         Lpips.find()
     except SceneFactoryError as error:
         bench.note(f"No LPIPS: {error}.")
     rows: list[dict[str, Any]] = []
     alone: list[dict[str, Any]] = []
-    for room in args.rooms:
-        spec = replace(shrunk(PRESETS[room], args.frames, args.stride, args.factor), depth="exact", novel_views=8)
+    for room, spec in specs.items():
         bag, mesh = simulated(spec, args.out)
         for kind in args.inputs:
             given = bag if kind == "rgbd" else without(bag, [DEPTH], "mono")
@@ -119,7 +164,7 @@ def main() -> None:
     tables = {"this run | paper": columns, "per room": rows, "means": [*means, *paper.other_rows()]}
     if alone:
         tables["depth alone"] = [*alone, mean_row(alone, room="mean")]
-    bench.write("Rooms like Replica's", tables)
+    return bench.write("Rooms like Replica's", tables)
 
 
 if __name__ == "__main__":
