@@ -45,7 +45,7 @@ def recover(images: ImageSet, setting: str) -> Recovered:
     """Depth of the reference with as much knowledge as the setting allows."""
     camera = None if setting == "e" else images.camera
     T = images.T_source_reference if setting == "c" else None
-    return MultiViewDepth(DepthConfig()).recover(images.images[0], images.images[1:], camera, T)
+    return MultiViewDepth(DepthConfig(), lens=True).recover(images.images[0], images.images[1:], camera, T)
 
 
 def measure(images: ImageSet, setting: str) -> dict[str, Any]:

@@ -38,7 +38,7 @@ class DepthConfig:
     # multi-view depth (paper Sec. Depth Recovery with Dense Correlation, Depth Frame Selection)
     matcher: str = option("flow", "dense matcher: flow, or one of an installed package")
     intrinsics: str = option("f", "what is estimated of an unknown camera: f, pinhole or radial")
-    lens: bool = option(True, "without given poses, a radial term is estimated where the images show one")
+    lens: bool = option(True, "an image set without poses that shows a lens is rectified")
     stride: int = option(4, "dense bundle adjustment uses every n-th pixel of both axes", low=1, high=32)
     rematches: int = option(1, "rounds of matching again from the geometry found so far", low=0, high=4)
     max_sources: int = option(4, "views a reference is triangulated with at most", low=1, high=16)

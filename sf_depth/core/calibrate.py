@@ -3,8 +3,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from sf_depth.config import DepthConfig
@@ -28,7 +26,7 @@ class Calibrator:
     """
 
     def __init__(self, config: DepthConfig) -> None:
-        self._mvd = MultiViewDepth(replace(config, lens=False))  # the best camera without a radial term
+        self._mvd = MultiViewDepth(config)
         self._views: list[tuple[UInt8, Features]] = []
         self.result: Recovered | None = None
 

@@ -93,10 +93,12 @@ class MultiViewDepth:
     Args:
         config: see :class:`DepthConfig`.
         matcher: replaces the one the configuration names.
+        lens: images without given poses may show a lens, which is then estimated (``Recovered.distortion``); for
+            those who take it out, as the camera is a pinhole.
     """
 
-    def __init__(self, config: DepthConfig, matcher: Matcher | None = None) -> None:
-        self._config = config
+    def __init__(self, config: DepthConfig, matcher: Matcher | None = None, *, lens: bool = False) -> None:
+        self._config, self._lens = config, lens
         self._matcher = matcher or load_matcher(config.matcher)
 
     def recover(
@@ -189,7 +191,7 @@ class MultiViewDepth:
 
         Beside an unknown focal length only where the views tell both.
         """
-        bent = _BENT.get(free) if self._config.lens else None
+        bent = _BENT.get(free) if self._lens else None
         if bent is None:
             return fit
         found = dense_ba.optimum(fit.seen, fit.adjusted.estimate, intrinsics=bent)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,7 +28,7 @@ class OneShot:
     """U2-MVD with the first image as reference and all others as sources, then completion (paper Sec. V)."""
 
     def __init__(self, config: DepthConfig) -> None:
-        self._mvd = MultiViewDepth(replace(config, lens=False))  # what is handed out is a pinhole
+        self._mvd = MultiViewDepth(config)
         self._filler = Filler(config)
 
     def estimate(self, frames: Sequence[Frame]) -> Estimated:

@@ -63,7 +63,7 @@ class PhotoSetDepth:
 
     def __init__(self, config: DepthConfig) -> None:
         self._config = config
-        self._mvd, self._rectified = (MultiViewDepth(c) for c in (config, replace(config, lens=False)))
+        self._mvd, self._rectified = (MultiViewDepth(config, lens=lens) for lens in (config.lens, False))
         self._filler = Filler(config)
 
     def estimate(self, frames: Sequence[Frame], heard: Callable[[int], None] = lambda done: None) -> PhotoSet:

@@ -56,34 +56,37 @@ SF_INLINE size_t mirrored(size_t row, int step, size_t rows) {
     return row + 1 < rows ? row + 1 : rows - 2;
 }
 
-// Sums over three rows of what one pixel contributes, padded by a mirrored column on both sides.
-template <class F>
-SF_INLINE void sum_rows(float* sums, size_t w, const F& of) {
-    for (size_t k = 0; k < w; k += kLanes) store(sums + 1 + k, of(k), w - k);
-    sums[0] = sums[2];
-    sums[w + 1] = sums[w - 1];
-}
-
 SF_INLINE Float8 mean_of(const float* sums, size_t k, size_t count) {
-    return (load<Float8>(sums + k, count) + load<Float8>(sums + k + 1, count) + load<Float8>(sums + k + 2, count)) / 9.0f;
+    const float* next = sums + k + 1;
+    return (load<Float8>(sums + k, count) + load<Float8>(next, count) + load<Float8>(next + 1, count)) / 9.0f;
 }
 
 // The cost of one row of one source, into the two least so far.
 SF_INLINE void compare(const Compared& c, const float* warped, const float* hidden, size_t r, float* sums, float* best,
                        float* second) {
     const size_t w = c.columns, rows[3] = {mirrored(r, -1, c.rows) * w, r * w, mirrored(r, 1, c.rows) * w};
-    float *b = sums, *bb = b + w + 2, *ab = bb + w + 2;
-    const auto three = [&](const auto& of) {
-        return [&, of](size_t k) { return of(rows[0] + k, w - k) + of(rows[1] + k, w - k) + of(rows[2] + k, w - k); };
-    };
-    const auto there = [&](size_t k, size_t count) { return load<Float8>(warped + k, count); };
-    sum_rows(b, w, three(there));
-    sum_rows(bb, w, three([&](size_t k, size_t count) { return there(k, count) * there(k, count); }));
-    sum_rows(ab, w, three([&](size_t k, size_t n) { return load<Float8>(c.first + k, n) * there(k, n); }));
+    float* of[3] = {sums, sums + (w + 2), sums + 2 * (w + 2)};  // b, b^2 and a b; a column more on both sides
+    for (size_t k = 0; k < w; k += kLanes) {
+        Float8 b = {}, bb = {}, ab = {};
+        for (const size_t row : rows) {
+            const Float8 there = load<Float8>(warped + row + k, w - k);
+            b += there;
+            bb += there * there;
+            ab += load<Float8>(c.first + row + k, w - k) * there;
+        }
+        store(of[0] + 1 + k, b, w - k);
+        store(of[1] + 1 + k, bb, w - k);
+        store(of[2] + 1 + k, ab, w - k);
+    }
+    for (float* row : of) {
+        row[0] = row[2];
+        row[w + 1] = row[w - 1];
+    }
     for (size_t k = 0; k < w; k += kLanes) {
         const size_t at = rows[1] + k, count = w - k;
-        const Float8 mean = mean_of(b, k, count), product = mean_of(ab, k, count) - load<Float8>(c.mean + at, count) * mean;
-        const Float8 variance = larger(mean_of(bb, k, count) - mean * mean, Float8{}) + c.noise;
+        const Float8 mean = mean_of(of[0], k, count);
+        const Float8 product = mean_of(of[2], k, count) - load<Float8>(c.mean + at, count) * mean;
+        const Float8 variance = larger(mean_of(of[1], k, count) - mean * mean, Float8{}) + c.noise;
         const Float8 alike = product * load<Float8>(c.scale + at, count) / root(variance);
         const Float8 cost = load<Float8>(hidden + at, count) > 0.0f ? Float8{} + c.unseen : 1.0f - alike;
         const Float8 least = load<Float8>(best + at, count);

@@ -19,7 +19,7 @@ from sf_interfaces.errors import ConfigError, FormatError, InsufficientParallax,
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import DepthMap, Frame, Keyframe, PointCloud
 
-MVD = MultiViewDepth(DepthConfig())
+MVD = MultiViewDepth(DepthConfig(), lens=True)
 
 
 def relative_error(depth: DepthMap, truth: np.ndarray, *, absolute: bool) -> np.ndarray:
