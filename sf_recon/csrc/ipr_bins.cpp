@@ -7,8 +7,8 @@ namespace sf {
 namespace {
 
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
-constexpr size_t kBlock = 512;   // points projected at a time, into the cache
-constexpr size_t kLanes = 16;   // of the widest vectors
+constexpr size_t kBlock = 512;    // points projected at a time, into the cache
+constexpr size_t kLanes = 16;    // of the widest vectors
 constexpr size_t kChunk = 8192;   // points a thread takes at a time
 
 // Points of a block that may be seen, and where they lie in the image.

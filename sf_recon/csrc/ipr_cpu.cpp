@@ -7,11 +7,12 @@
 #include <cmath>
 
 #include "ipr_bins.hpp"
+#include "ipr_pixels.hpp"
 
 namespace sf {
 namespace {
 
-constexpr int kPixels = kTile * kTile, kBuckets = 256;
+constexpr int kBuckets = 256;
 constexpr float kInfinity = std::numeric_limits<float>::infinity();
 constexpr float kHole = std::numeric_limits<float>::quiet_NaN();
 
@@ -32,26 +33,6 @@ struct Item {  // a fragment to be sorted
     int y1() const { return window >> 24; }
 };
 
-// One bit for each pixel of the tile, four rows a word; a word to spare.
-struct Pixels {
-    uint64_t word[kPixels / 64 + 1] = {};
-
-    bool any() const { return word[0] | word[1] | word[2] | word[3]; }
-    // Four rows from row y on.
-    uint64_t rows(int y) const {
-        const int shift = kTile * (y % 4);
-        return word[y / 4] >> shift | word[y / 4 + 1] << 1 << (63 - shift);
-    }
-    void add(int y, uint64_t rows) {
-        const int shift = kTile * (y % 4);
-        word[y / 4] |= rows << shift, word[y / 4 + 1] |= rows >> 1 >> (63 - shift);
-    }
-    void remove(int y, uint64_t rows) {
-        const int shift = kTile * (y % 4);
-        word[y / 4] &= ~(rows << shift), word[y / 4 + 1] &= ~(rows >> 1 >> (63 - shift));
-    }
-};
-
 struct TileScratch {
     std::vector<uint32_t> windows;
     std::vector<int32_t> ids;    // rows in the cloud
@@ -63,7 +44,7 @@ struct TileScratch {
     int32_t count[kPixels];      // points of the first layer
     Pixels open;                 // whose list takes more points
     Pixels drawn, recent;        // that some point covers; that one covers since `recent_z`
-    float recent_z, last_z;      // depth of the last point
+    float recent_z, last_z;      // depth where that began, and of the last point
 
     void reserve(size_t n) {
         if (windows.size() >= n) return;
