@@ -1,7 +1,7 @@
 """Scale of a depth map that was recovered without poses (paper Sec. Recover Scale to Global).
 
-Either the tracker's landmarks or given translations hold the global scale. Both are robust: one wrong landmark
-or one wrong pose does not move it. Every threshold is relative, so there is no limit on distance.
+Given translations hold the global scale; one wrong pose does not move it. Every threshold is relative, so there is no
+limit on distance. (Depth of SLAM's keyframes needs no such step: it is swept at their poses.)
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -12,14 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sf_interfaces.errors import InsufficientParallax
-from sf_interfaces.types import Camera, DepthMap, Float32, Float64
+from sf_interfaces.types import DepthMap, Float64
 
 _TOLERANCE = 0.05  # relative difference of an inlier
-_LEAST_LANDMARKS = 8
-_MAD = 1.4826 * 1.2533  # from a median deviation to the deviation of a median, times the root of the count
 _CHI2_MEDIAN = 2.366  # of three degrees of freedom: a squared length per component
 _FEW = 1.6  # what few translations, as one, tell of their own spread: 1 + this / count is that of Student's quantile
-_LEAST_SHARE = 0.3  # of the landmarks that have to agree
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,32 +33,6 @@ def consensus(ratios: Float64) -> tuple[float, np.ndarray]:
     near = np.abs(logs[None] - logs[:, None]) < _TOLERANCE
     best = int(near.sum(axis=1).argmax())
     return float(np.exp(np.median(logs[near[best]]))), near[best]
-
-
-def from_landmarks(z: Float32, landmarks: Float64, camera: Camera) -> GlobalScale:
-    """What brings depth z [H, W] to the unit of landmarks [N, 3] in the optical frame.
-
-    Raises:
-        InsufficientParallax: too few landmarks fall on estimated depth, or they do not agree.
-    """
-    uv, depth = camera.project(landmarks)
-    height, width = z.shape
-    col, row = np.floor(np.nan_to_num(uv, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64).T
-    inside = (depth > 0) & (col >= 0) & (col < width) & (row >= 0) & (row < height)
-    own = z[row[inside], col[inside]]
-    ratios = (depth[inside] / own)[np.isfinite(own) & (own > 0)]
-    if len(ratios) < _LEAST_LANDMARKS:
-        raise InsufficientParallax(
-            f"only {len(ratios)} landmarks fall on estimated depth, the scale needs {_LEAST_LANDMARKS}; "
-            "move slower or into a scene with more texture"
-        )
-    scale, inlier = consensus(ratios)
-    if inlier.mean() < _LEAST_SHARE:
-        raise InsufficientParallax(
-            f"{inlier.mean():.0%} of {len(ratios)} landmarks agree on a scale, {_LEAST_SHARE:.0%} are needed"
-        )
-    spread = _MAD * float(np.median(np.abs(np.log(ratios / scale))))  # wrong landmarks hardly count
-    return GlobalScale(scale, spread / np.sqrt(len(ratios)))
 
 
 def from_translations(estimated: Float64, given: Float64) -> GlobalScale:

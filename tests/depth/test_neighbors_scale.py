@@ -11,7 +11,7 @@ import pytest
 from sf_depth.core.monodepth import StructurePrior, load_monodepth
 from sf_depth.core.neighbors import NeighborLimits, before_and_after, find_good_neighbors
 from sf_depth.core.outliers import lonely
-from sf_depth.core.scale import from_landmarks, from_translations
+from sf_depth.core.scale import from_translations
 from sf_interfaces.errors import ConfigError, InsufficientParallax
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, DepthMap
@@ -35,18 +35,6 @@ def test_neighbours_come_from_both_sides_where_they_can() -> None:
     poses = [pose(0.1 * k) for k in range(7)]
     assert before_and_after(3, poses, 1.0, LIMITS, 4) == [0, 1, 5, 6]
     assert before_and_after(0, poses, 1.0, LIMITS, 4) == [1, 2, 3]
-
-
-def test_landmarks_give_the_scale_in_spite_of_wrong_ones() -> None:
-    rng = np.random.default_rng(0)
-    z = rng.uniform(50, 200, (60, 80)).astype(np.float32)
-    pixels = CAMERA.pixel_grid()[5::7, 5::7].reshape(-1, 2)
-    depth = 0.02 * z[5::7, 5::7].ravel().astype(np.float64)
-    depth[::3] *= rng.uniform(0.3, 3, len(depth[::3]))
-    landmarks = CAMERA.unproject(pixels, depth)
-    assert abs(from_landmarks(z, landmarks, CAMERA).factor / 0.02 - 1) < 0.01
-    with pytest.raises(InsufficientParallax, match="only 3 landmarks"):
-        from_landmarks(z, landmarks[:3], CAMERA)
 
 
 def test_translations_give_the_scale_in_spite_of_a_wrong_one() -> None:
