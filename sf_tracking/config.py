@@ -14,7 +14,7 @@ class TrackingConfig:
 
     operator: str = option("patches", "update operator: patches (alignment) or dpvo (network)")
     checkpoint: str = option("", "file of the DPVO network's weights, for operator dpvo")
-    patches: int = option(200, "patches per keyframe (M); twice as many without depth", low=20, high=4000)
+    patches: int = option(200, "patches per keyframe (M); three times as many without depth", low=20, high=4000)
     window: int = option(9, "keyframes whose patches are aligned and whose poses are optimised", low=3, high=100)
     edges: int = option(600, "patches aligned to a frame that becomes no keyframe", low=50, high=20000)
     patch_px: int = option(11, "side of an aligned patch, px", low=5, high=41)

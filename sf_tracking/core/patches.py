@@ -18,7 +18,7 @@ _PLANE_NEIGHBOURS = 12  # points of sparse depth to which a plane is fitted
 _SPACING = 3.0  # px, side of the cells of which each gives one of them
 _KNOWN_SHARE = 0.5  # of the window that must carry depth
 _GRAZING = 0.04  # relative change of depth per px, above which a surface is seen too flat to be measured
-_FREE = 2  # times as many patches where their depth has to be found as well
+_FREE = 3  # times as many patches where their depth has to be found as well
 _SPARES = 1.6  # candidates per wanted patch, since some fail the test of their depth
 
 
