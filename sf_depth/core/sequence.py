@@ -9,7 +9,7 @@ others confirms it (slam). What neither knows is completed.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
@@ -26,13 +26,14 @@ from sf_interfaces.types import Keyframe
 
 _AHEAD = 6  # later frames a keyframe waits for
 _KEPT = 24  # frames that may still become neighbours
-_LEAST_NEIGHBORS = 2  # tau_nb of the paper
 _LEAST_DENSITY = 0.01  # share of the pixels whose depth has to be known before gaps are filled
 _NOTHING_MEASURED = "keyframe without measured depth, as between the sweeps of a LiDAR"
 
 
 class Setting(Protocol):
     """What tells the two modes apart."""
+
+    least_neighbors: ClassVar[int]  # good neighbours a reference needs
 
     def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
         """Whether a frame becomes a reference; ``last`` was one, the scene is ``depth`` away."""
@@ -53,6 +54,8 @@ class Setting(Protocol):
 
 class SlamSetting:
     """Every keyframe of the tracker gets depth, by a sweep at its pose that other keyframes confirm."""
+
+    least_neighbors: ClassVar[int] = 1  # what one source alone tells others still have to confirm
 
     def __init__(self) -> None:
         self._consensus = Consensus()
@@ -82,6 +85,7 @@ class PosedSetting:
     """Frames with given poses; those that moved on become references. The poses hold the scale."""
 
     spacing: float
+    least_neighbors: ClassVar[int] = 2  # tau_nb of the paper
 
     def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
         """It moved or turned enough since the last one."""
@@ -176,7 +180,7 @@ class SequenceDepth:
         self._depth = self._setting.scene_depth(frame, others) or self._depth
         poses = [other.T_map_camera for other in self._frames]
         chosen = before_and_after(index, poses, self._depth, self._limits, self._config.max_sources)
-        if len(chosen) < _LEAST_NEIGHBORS:
+        if len(chosen) < self._setting.least_neighbors:
             return self._skip("too few good neighbours: the camera hardly moves, or turns too fast")
         try:
             found, contradicted = self._setting.recover(self._mvd, frame, [self._frames[j] for j in chosen])
