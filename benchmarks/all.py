@@ -28,7 +28,7 @@ FOLDER = {
     ),
     "depth": (["--line", "room0"], ["--all", "--oracle", "--line", *_ROOMS, "hall"]),
     "live_map": ([], []),
-    "colour": (["--methods", "ours", "tsdf", "warp"], []),
+    "colour": (["--methods", "ours", "warp"], []),
     "map_memory": (["--keyframes", "12"], ["--keyframes", "100"]),
     "loops": (
         ["--walks", "room-rgbd", "room-mono", "--factor", "0.25", "--lost"],
