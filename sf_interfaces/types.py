@@ -101,6 +101,11 @@ class Camera:
             v = self.fy * points[..., 1] / z + self.cy
         return np.stack([u, v], axis=-1), z
 
+    def sees(self, uv: Float64, z: Float64) -> NDArray[np.bool_]:
+        """Which of the pixels [N, 2] and depths [N] of :meth:`project` lie in the image and before the camera, [N]."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray((z > 0) & (uv >= 0).all(axis=1) & (uv < (self.width, self.height)).all(axis=1))
+
     def unproject(self, pixels: Float64, z: Float64) -> Float64:
         """Continuous pixels [..., 2] with depth z [...] m -> camera points [..., 3] m."""
         pixels = np.asarray(pixels, dtype=np.float64)

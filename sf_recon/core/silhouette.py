@@ -76,7 +76,7 @@ def _support(
     T = se3.inverse(view.T_map_camera)
     points, _ = backproject(camera, T_map_camera, z, pixels)
     uv, d = view.camera.project(se3.transform(T, points.astype(np.float64)))
-    inside = (d > 0) & (uv >= 0).all(axis=1) & (uv[:, 0] < view.camera.width) & (uv[:, 1] < view.camera.height)
+    inside = view.camera.sees(uv, d)
     column, row = np.floor(np.where(inside[:, None], uv, 0)).astype(np.intp).T
     seen = view.z[row, column].astype(np.float32) * np.float32(view.step)
     ratio = seen / np.where(inside, d, 1).astype(np.float32)

@@ -333,7 +333,6 @@ def _same_view(keyframe: Keyframe, T_other_own: Float64, config: TrackingConfig)
     assert cloud is not None
     X = cloud.points.astype(np.float64)
     uv, z = camera.project(se3.transform(T_other_own, X))
-    with np.errstate(invalid="ignore"):
-        seen = (z > 0) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+    seen = camera.sees(uv, z)
     flow = np.linalg.norm(uv - camera.project(X)[0], axis=1)[seen]
     return bool(seen.mean() >= config.keyframe_overlap and flow.mean() <= config.keyframe_flow * camera.width)

@@ -138,6 +138,5 @@ def _spread(uv: Float64, camera: Camera) -> int:
 def _seen(points: Float64, T_cw: Float64, camera: Camera, found: Features, agreed: NDArray[np.int64]) -> float:
     """Share of the points in view that agree."""
     uv, z = camera.project(se3.transform(T_cw, points))
-    with np.errstate(invalid="ignore"):
-        visible = (z > 0) & (uv >= 0).all(axis=1) & (uv < (camera.width, camera.height)).all(axis=1)
+    visible = camera.sees(uv, z)
     return len(np.unique(agreed)) / max(1, int(visible.sum()))

@@ -130,8 +130,7 @@ def fit_points(frame: Frame, points: Float64, T: Float64, prior: Float64, config
         return None
     seen = se3.transform(T, points)
     uv, z = frame.camera.project(seen)
-    with np.errstate(invalid="ignore"):
-        inside = (z > 0) & (uv >= 0).all(axis=1) & (uv < (frame.camera.width, frame.camera.height)).all(axis=1)
+    inside = frame.camera.sees(uv, z)
     seen, z = seen[inside], z[inside]
     sigma = config.depth_sigma * z**2 if frame.depth is not None else np.full(len(z), config.lidar_sigma)
     source = Shape(seen, np.full_like(seen, np.nan), None, None, sigma, shape.least, independent=1.0)
