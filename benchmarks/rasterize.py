@@ -21,7 +21,6 @@ from typing import Any
 
 import clouds
 import numpy as np
-import open3d as o3d
 
 from sf_interfaces.types import Camera
 from sf_recon.core.ipr_reference import RasterOptions
@@ -40,6 +39,8 @@ def adaptive(count: int) -> RasterOptions:
 
 def open3d_calls(points: np.ndarray, camera: Camera, T: np.ndarray) -> dict[str, Callable[[], object]]:
     """Open3D's projections of the same cloud: one pixel per point, the nearest wins."""
+    import open3d as o3d
+
     cloud = o3d.t.geometry.PointCloud(o3d.core.Tensor(points))
     cloud.point.colors = o3d.core.Tensor(np.zeros_like(points))
     K = o3d.core.Tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], o3d.core.float64)

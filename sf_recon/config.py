@@ -51,7 +51,7 @@ class ReconConfig:
     live_turns: int = option(200, "live: training iterations of a keyframe after which it rests", low=1)
     view_port: int = option(0, "live: port of the viewer's page on this machine; 0: none", low=0, high=65535)
     psnr_goal: float = option(25.0, "live: timing.json says how long a keyframe takes to reach this, dB", low=0.0)
-    rasterizer: str = option("native", "native (compiled) or reference (numpy, slow)")
+    rasterizer: str = option("native", "native (compiled), cuda (where built with it) or reference (numpy, slow)")
     k_ray: int = option(8, "points drawn into one pixel at most (K_ray)", low=1, high=64)
     coverage: float = option(2.0, "side of a point's window on screen, in resolutions", low=0.1, high=10.0)
     layer_gap: float = option(4.0, "step in depth that ends the first layer, in resolutions", low=0.0)

@@ -13,6 +13,7 @@ from sf_interfaces.types import Camera, Float32, Float64
 from sf_recon.config import ReconConfig
 from sf_recon.core.ipr_reference import OUTPUTS, Raster, RasterOptions, rasterize_reference
 from sf_recon.core.native import native
+from sf_recon.core.rasterizer_cuda import CudaRasterizer
 
 NEAR = 10.0  # near plane, in resolutions: closer, a point would cover a visible part of the image
 
@@ -68,10 +69,12 @@ def make_rasterizer(config: ReconConfig) -> Rasterizer:
     """The rasteriser that ``config.rasterizer`` names.
 
     Raises:
-        ConfigError: the name is neither native nor reference.
+        ConfigError: another name, or cuda without its kernels or a device.
     """
     if config.rasterizer == "reference":
         return rasterize_reference
     if config.rasterizer == "native":
         return partial(rasterize, threads=config.threads)
-    raise ConfigError(f"recon.rasterizer must be native or reference, got '{config.rasterizer}'")
+    if config.rasterizer == "cuda":
+        return CudaRasterizer().draw
+    raise ConfigError(f"recon.rasterizer must be native, cuda or reference, got '{config.rasterizer}'")

@@ -3,6 +3,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Collection
 from typing import Any
 
@@ -11,26 +12,32 @@ import torch
 from torch import Tensor
 
 from sf_interfaces.errors import ConfigError
-from sf_interfaces.types import Camera, Float64
-from sf_recon.core.ipr_reference import RasterOptions
+from sf_interfaces.types import Camera, Float32, Float64
+from sf_recon.core.ipr_reference import Raster, RasterOptions
 from sf_recon.core.native import native
 
 HOW_TO_BUILD = "build it with the CUDA toolkit: pip install . -Ccmake.define.SF_CUDA=ON"
+KEPT = 8  # clouds that stay on the device from view to view: those of the levels of a map
 
 
 class CudaRasterizer:
     """Draws points of one device; keeps the memory it needs from frame to frame.
 
     Raises:
-        ConfigError: the kernels were built without CUDA.
+        ConfigError: the kernels were built without CUDA, or torch finds no device.
     """
 
     def __init__(self, device: int = 0) -> None:
         module = native()
         if not hasattr(module, "CudaRasterizer"):
             raise ConfigError(f"the compiled kernels have no CUDA rasteriser; {HOW_TO_BUILD}")
+        if not torch.cuda.is_available():
+            raise ConfigError(
+                "torch finds no CUDA device: install a CUDA build of torch, or set recon.rasterizer=native"
+            )
         self._device = torch.device("cuda", device)
         self._kernel: Any = module.CudaRasterizer(device)
+        self._clouds: deque[tuple[Float32, Tensor]] = deque(maxlen=KEPT)
 
     def rasterize(
         self,
@@ -66,3 +73,29 @@ class CudaRasterizer:
             torch.cuda.current_stream(self._device).cuda_stream,
         )
         return images
+
+    def draw(
+        self,
+        points: Float32,
+        camera: Camera,
+        T_camera_map: Float64,
+        options: RasterOptions,
+        *,
+        outputs: Collection[str] = ("position",),
+        normals: Float32 | None = None,
+    ) -> Raster:
+        """Draw points [N, 3] that lie on the CPU; the images come back there.
+
+        The array is sent when it is seen first, so it must not be changed in place afterwards.
+        """
+        on_device = None if normals is None else torch.from_numpy(normals).to(self._device)
+        images = self.rasterize(self._sent(points), camera, T_camera_map, options, outputs=outputs, normals=on_device)
+        return Raster(**{name: image.cpu().numpy() for name, image in images.items()})
+
+    def _sent(self, points: Float32) -> Tensor:
+        for known, tensor in self._clouds:
+            if known is points:
+                return tensor
+        tensor = torch.from_numpy(np.ascontiguousarray(points, dtype=np.float32)).to(self._device)
+        self._clouds.append((points, tensor))
+        return tensor

@@ -6,16 +6,21 @@ from __future__ import annotations
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 
 from sf_interfaces.errors import ConfigError
+from sf_interfaces.types import Camera
+from sf_recon.config import ReconConfig
+from sf_recon.core.ipr_reference import RasterOptions
 from sf_recon.core.native import native
-from sf_recon.core.rasterizer import rasterize
+from sf_recon.core.rasterizer import make_rasterizer, rasterize
 from sf_recon.core.rasterizer_cuda import CudaRasterizer
-from tests.recon.test_rasterizer import CAMERA, CLOUDS, EVERYTHING, OPTIONS, POSE
+from tests.recon.test_rasterizer import ANY_CLOUD, CAMERA, CLOUDS, EVERYTHING, OPTIONS, POSE, assert_equals_definition
 
 CSRC = Path(__file__).resolve().parents[2] / "sf_recon" / "csrc"
 BUILT = hasattr(native(), "CudaRasterizer")
@@ -41,7 +46,7 @@ def test_it_compiles(architecture: str, tmp_path: Path) -> None:
 @pytest.mark.skipif(BUILT, reason="the kernels are built with CUDA")
 def test_without_cuda_it_says_how_to_build() -> None:
     with pytest.raises(ConfigError, match="SF_CUDA=ON"):
-        CudaRasterizer()
+        make_rasterizer(ReconConfig(rasterizer="cuda"))
 
 
 @needs_gpu
@@ -66,6 +71,13 @@ def test_it_equals_the_cpu(name: str, with_normals: bool) -> None:
 
 
 @needs_gpu
+@settings(max_examples=200, deadline=None)
+@ANY_CLOUD
+def test_it_equals_the_definition_on_any_cloud(**case: Any) -> None:
+    assert_equals_definition(make_rasterizer(ReconConfig(rasterizer="cuda")), **case)
+
+
+@needs_gpu
 def test_streams_and_growing_clouds_share_one_workspace() -> None:
     rasterizer = CudaRasterizer()
     for name in ("one", "dense", "empty", "scattered"):
@@ -73,3 +85,25 @@ def test_streams_and_growing_clouds_share_one_workspace() -> None:
             got = rasterizer.rasterize(torch.from_numpy(CLOUDS[name]).cuda(), CAMERA, POSE, OPTIONS)
             depth = got["depth"].cpu()
         np.testing.assert_allclose(depth, rasterize(CLOUDS[name], CAMERA, POSE, OPTIONS).depth, rtol=1e-5)
+
+
+@needs_gpu
+def test_clouds_of_the_cpu_are_sent_once_and_drawn_again_when_they_are_others() -> None:
+    draw = make_rasterizer(ReconConfig(rasterizer="cuda"))
+    for name in ("dense", "scattered", "dense", "one", "empty", "dense"):
+        drawn = draw(CLOUDS[name], CAMERA, POSE, OPTIONS, outputs=("position", "index"))
+        expected = rasterize(CLOUDS[name], CAMERA, POSE, OPTIONS, outputs=("position", "index"))
+        np.testing.assert_array_equal(drawn.index, expected.index)
+        np.testing.assert_allclose(drawn.depth, expected.depth, rtol=1e-5)
+        assert drawn.normal is None
+
+
+@needs_gpu
+@pytest.mark.parametrize("radius", [0.001, 0.02])
+def test_ten_million_points_equal_the_cpu(radius: float) -> None:
+    points = np.random.default_rng(0).uniform([-1, -1, 0.1], [1, 1, 1], (10_000_000, 3)).astype(np.float32)
+    camera, options = Camera(640, 480, 585, 585, 320, 240), RasterOptions(radius, 0.1, 0.02)
+    drawn = CudaRasterizer().draw(points, camera, np.eye(4), options, outputs=("index",))
+    expected = rasterize(points, camera, np.eye(4), options, outputs=("index",))
+    np.testing.assert_array_equal(drawn.index, expected.index)
+    np.testing.assert_allclose(drawn.depth, expected.depth, rtol=1e-5)
