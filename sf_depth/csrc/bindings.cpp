@@ -1,13 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 // Python module sf_depth._native: arrays in, arrays out. Bad shapes are a TypeError or a ValueError. The interpreter
 // is let go of while a kernel runs, so that several threads may.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
+#include <sf_native/arrays.hpp>
 
 #include <algorithm>
-#include <initializer_list>
-#include <memory>
-#include <vector>
 
 #include "dense_ba.hpp"
 #include "plane_sweep.hpp"
@@ -16,33 +12,7 @@ namespace nb = nanobind;
 
 namespace {
 
-template <class T, nb::ssize_t... N>
-using In = nb::ndarray<const T, nb::shape<N...>, nb::c_contig, nb::device::cpu>;
-template <class T>
-using Out = nb::ndarray<nb::numpy, T>;
-
-// An array that Python will own.
-template <class T>
-struct Made {
-    std::unique_ptr<T[]> data;
-    std::vector<size_t> shape;
-
-    explicit Made(std::initializer_list<size_t> shape_) : shape(shape_) {
-        size_t size = 1;
-        for (const size_t extent : shape) size *= extent;
-        data.reset(new T[size]);
-    }
-    T* get() { return data.get(); }
-    Out<T> give() {
-        T* raw = data.release();
-        nb::capsule owner(raw, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-        return Out<T>(raw, shape.size(), shape.data(), owner);
-    }
-};
-
-void require(bool good, const char* what) {
-    if (!good) throw nb::value_error(what);
-}
+using sf::alone, sf::In, sf::Made, sf::Out, sf::require;
 
 sf::Views views_of(const In<double, 5>& theta, const In<double, -1, 4, 4>& T, const In<double, 2, -1>& x,
                    const In<double, -1>& d, const In<double, -1, 2, -1>& target, const In<double, -1, -1>& weight) {
@@ -57,20 +27,14 @@ Out<float> squared_residuals(In<double, 5> theta, In<double, -1, 4, 4> T, In<dou
                              In<double, -1, 2, -1> target, In<double, -1, -1> weight) {
     const sf::Views views = views_of(theta, T, x, d, target, weight);
     Made<float> squares({views.sources, views.pixels});
-    {
-        nb::gil_scoped_release free;
-        sf::squared_residuals(views, squares.get());
-    }
+    alone([&] { sf::squared_residuals(views, squares.get()); });
     return squares.give();
 }
 
 nb::tuple robust_cost(In<float, -1, -1> squares, In<double, -1, -1> weight, double c2, double blind) {
     require(squares.shape(0) == weight.shape(0) && squares.shape(1) == weight.shape(1), "one weight per residual");
     double cost = 0, total = 0;
-    {
-        nb::gil_scoped_release free;
-        sf::robust_cost(squares.data(), weight.data(), squares.size(), c2, blind, cost, total);
-    }
+    alone([&] { sf::robust_cost(squares.data(), weight.data(), squares.size(), c2, blind, cost, total); });
     return nb::make_tuple(cost, total);
 }
 
@@ -84,11 +48,10 @@ nb::tuple linearise(In<double, 5> theta, In<double, -1, 4, 4> T, In<double, 2, -
     const size_t P = (poses ? 6 * views.sources : 0) + free_ones;
     Made<double> H({P, P}), g({P});
     Made<float> E({P, N}), C({N}), w({N}), each({scores ? P : 0, N});
-    {
-        nb::gil_scoped_release free;
+    alone([&] {
         sf::linearise(views, {free_ones, dx.data(), columns.data()}, poses, c2,
                       {H.get(), g.get(), E.get(), C.get(), w.get(), scores ? each.get() : nullptr});
-    }
+    });
     return nb::make_tuple(H.give(), g.give(), E.give(), C.give(), w.give(), each.give());
 }
 
@@ -98,10 +61,7 @@ nb::tuple eliminate(In<float, -1, -1> E, In<float, -1> C, In<float, -1> w, In<do
                 g.shape(0) == rows,
             "H, g, C and w do not fit E");
     Made<double> S({rows, rows}), b({rows});
-    {
-        nb::gil_scoped_release free;
-        sf::eliminate(E.data(), C.data(), w.data(), H.data(), g.data(), rows, pixels, S.get(), b.get());
-    }
+    alone([&] { sf::eliminate(E.data(), C.data(), w.data(), H.data(), g.data(), rows, pixels, S.get(), b.get()); });
     return nb::make_tuple(S.give(), b.give());
 }
 
@@ -109,10 +69,7 @@ Out<double> substitute(In<float, -1, -1> E, In<float, -1> C, In<float, -1> w, In
     const size_t rows = E.shape(0), pixels = E.shape(1);
     require(C.shape(0) == pixels && w.shape(0) == pixels && dx.shape(0) == rows, "C, w and dx do not fit E");
     Made<double> dd({pixels});
-    {
-        nb::gil_scoped_release free;
-        sf::substitute(E.data(), C.data(), w.data(), dx.data(), rows, pixels, dd.get());
-    }
+    alone([&] { sf::substitute(E.data(), C.data(), w.data(), dx.data(), rows, pixels, dd.get()); });
     return dd.give();
 }
 
@@ -128,10 +85,7 @@ Out<float> dissimilarity(In<float, -1, -1> first, In<float, -1, -1> mean, In<flo
                    {}, {zoom(0), zoom(1)}, least_z, noise, unseen};
     std::copy_n(theta.data(), 5, c.theta);
     Made<float> cost({h, w});
-    {
-        nb::gil_scoped_release free;
-        sf::dissimilarity(c, d, cost.get());
-    }
+    alone([&] { sf::dissimilarity(c, d, cost.get()); });
     return cost.give();
 }
 
@@ -140,10 +94,9 @@ Out<float> best_paths(In<float, -1, -1, -1> cost, In<float, -1, -1> image, bool 
     const size_t h = cost.shape(0), w = cost.shape(1), planes = cost.shape(2);
     require(image.shape(0) == h && image.shape(1) == w && planes > 0, "the image does not fit the cost");
     Made<float> total({h, w, planes});
-    {
-        nb::gil_scoped_release free;
+    alone([&] {
         sf::best_paths({h, w, planes, cost.data(), image.data()}, upright, {bend, jump, edge}, total.get());
-    }
+    });
     return total.give();
 }
 

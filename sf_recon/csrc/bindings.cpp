@@ -1,14 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 // Python module sf_recon._native: arrays in, arrays out. Bad shapes are a TypeError, bad coordinates an IndexError.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
+#include <sf_native/arrays.hpp>
 
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <memory>
 #include <mutex>
 #include <optional>
 #include <shared_mutex>
@@ -28,95 +26,74 @@ void bind_cuda(nb::module_& m);
 
 namespace {
 
-using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
-using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using MutableRows = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Ids = nb::ndarray<const int32_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Values = nb::ndarray<const float, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Vector = nb::ndarray<const float, nb::shape<3>, nb::c_contig, nb::device::cpu>;
-using Matrix4 = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
-using Image = nb::ndarray<const float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
-using Halves = nb::ndarray<uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Steps = nb::ndarray<int16_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Matrix3 = nb::ndarray<const float, nb::shape<3, 3>, nb::c_contig, nb::device::cpu>;
-using Grid2 = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Mask = nb::ndarray<const uint8_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Counts = nb::ndarray<const uint16_t, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using Bytes = nb::ndarray<const uint8_t, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
-using MutableGrid = nb::ndarray<float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
-using MutableImage = nb::ndarray<float, nb::shape<-1, -1, 3>, nb::c_contig, nb::device::cpu>;
-template <class T>
-using Out = nb::ndarray<nb::numpy, T>;
+using sf::alone, sf::In, sf::InOut, sf::Made, sf::Out, sf::require;
+
+using Points = In<float, -1, 3>;
+using Rows = In<float, -1, -1>;
+using Ids = In<int32_t, -1, -1>;
+using Values = In<float, -1>;
+using Vector = In<float, 3>;
+using Matrix4 = In<float, 4, 4>;
+using Image = In<float, -1, -1, 3>;
+using Halves = InOut<uint16_t, -1, -1>;
 
 template <class T>
-Out<T> give(std::unique_ptr<T[]> data, std::initializer_list<size_t> shape) {
-    T* raw = data.release();
-    nb::capsule owner(raw, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-    return Out<T>(raw, shape, owner);
-}
-
-template <class T>
-Out<T> give(const std::vector<T>& values, size_t columns = 0) {
-    std::unique_ptr<T[]> data(new T[values.size()]);
-    std::copy(values.begin(), values.end(), data.get());
-    if (columns == 0) return give(std::move(data), {values.size()});
-    return give(std::move(data), {values.size() / columns, columns});
+Out<T> copied(const std::vector<T>& values, std::vector<size_t> shape) {
+    Made<T> made(std::move(shape));
+    std::copy(values.begin(), values.end(), made.get());
+    return made.give();
 }
 
 nb::tuple knn(const sf::PointGrid& grid, Points queries, int k, float radius, int threads) {
     if (k < 1 || k > sf::kMaxNeighbours || !(radius > 0) || !std::isfinite(radius))
         throw nb::value_error("knn needs 1 <= k <= 64 and a finite radius > 0");
     const size_t n = queries.shape(0);
-    std::unique_ptr<int32_t[]> ids(new int32_t[n * k]);
-    std::unique_ptr<float[]> distance2(new float[n * k]);
-    bool inside;
-    {
-        nb::gil_scoped_release release;
+    Made<int32_t> ids({n, static_cast<size_t>(k)});
+    Made<float> distance2({n, static_cast<size_t>(k)});
+    const bool inside = alone([&] {
         std::shared_lock<std::shared_mutex> reading(grid.mutex());
-        inside = grid.knn(queries.data(), n, k, radius, ids.get(), distance2.get(), threads);
-    }
+        return grid.knn(queries.data(), n, k, radius, ids.get(), distance2.get(), threads);
+    });
     if (!inside) throw nb::index_error("a query is not finite or lies too far from the origin");
-    return nb::make_tuple(give(std::move(ids), {n, static_cast<size_t>(k)}),
-                          give(std::move(distance2), {n, static_cast<size_t>(k)}));
+    return nb::make_tuple(ids.give(), distance2.give());
 }
 
 void add(sf::PointGrid& grid, Points points) {
-    nb::gil_scoped_release release;
-    std::unique_lock<std::shared_mutex> writing(grid.mutex());
-    for (size_t i = 0; i < points.shape(0); ++i) grid.add(points.data() + 3 * i);
+    alone([&] {
+        std::unique_lock<std::shared_mutex> writing(grid.mutex());
+        for (size_t i = 0; i < points.shape(0); ++i) grid.add(points.data() + 3 * i);
+    });
 }
 
 nb::tuple add_spaced(sf::PointGrid& grid, Points points, float spacing, float copy_radius) {
     std::vector<int32_t> rows, parents;
-    {
-        nb::gil_scoped_release release;
+    alone([&] {
         std::unique_lock<std::shared_mutex> writing(grid.mutex());
         grid.add_spaced(points.data(), points.shape(0), spacing, copy_radius, rows, parents);
-    }
-    return nb::make_tuple(give(rows), give(parents));
+    });
+    return nb::make_tuple(copied(rows, {rows.size()}), copied(parents, {parents.size()}));
 }
 
 Out<float> voxel_means(Rows rows, float cell_size) {
-    if (rows.shape(1) < 3) throw nb::value_error("voxel_means needs at least three columns");
-    return give(sf::voxel_means(rows.data(), rows.shape(0), rows.shape(1), cell_size), rows.shape(1));
+    require(rows.shape(1) >= 3, "voxel_means needs at least three columns");
+    const std::vector<float> means = sf::voxel_means(rows.data(), rows.shape(0), rows.shape(1), cell_size);
+    return copied(means, {means.size() / rows.shape(1), rows.shape(1)});
 }
 
 Out<float> interpolate(Rows table, Ids ids, Rows weights, int threads) {
     const size_t n = ids.shape(0), columns = table.shape(1);
     if (weights.shape(0) != n || weights.shape(1) != ids.shape(1))
         throw nb::value_error("interpolate: ids and weights differ in shape");
-    std::unique_ptr<float[]> out(new float[n * columns]);
-    bool good;
-    {
-        nb::gil_scoped_release release;
-        good = sf::interpolate(table.data(), table.shape(0), columns, ids.data(), weights.data(), n, ids.shape(1),
+    Made<float> out({n, columns});
+    const bool good = alone([&] {
+        return sf::interpolate(table.data(), table.shape(0), columns, ids.data(), weights.data(), n, ids.shape(1),
                                out.get(), threads);
-    }
+    });
     if (!good) throw nb::index_error("interpolate: id out of range");
-    return give(std::move(out), {n, columns});
+    return out.give();
 }
 
-void adam_rows(Ids ids, Rows weights, Rows gradient, MutableRows table, Halves mean, Halves root, Steps steps,
+void adam_rows(Ids ids, Rows weights, Rows gradient, InOut<float, -1, -1> table, Halves mean, Halves root, InOut<int16_t, -1> steps,
                float rate, float beta1, float beta2, float epsilon, int threads) {
     const size_t n = ids.shape(0), k = ids.shape(1), rows = table.shape(0), columns = table.shape(1);
     if (weights.shape(0) != n || weights.shape(1) != k || gradient.shape(0) != n || gradient.shape(1) != columns)
@@ -130,9 +107,10 @@ void adam_rows(Ids ids, Rows weights, Rows gradient, MutableRows table, Halves m
         throw nb::index_error("adam_rows: id out of range");
 }
 
-void blend_view(Grid2 z, Mask surface, Bytes image, Counts depth, float step, Matrix3 A, Vector b, float trust,
-                float weight, const std::array<float, 4>& rules, MutableImage color, MutableGrid total,
-                MutableGrid confidence, int threads) {
+void blend_view(Rows z, In<uint8_t, -1, -1> surface, In<uint8_t, -1, -1, 3> image, In<uint16_t, -1, -1> depth,
+                float step, In<float, 3, 3> A, Vector b, float trust, float weight, const std::array<float, 4>& rules,
+                InOut<float, -1, -1, 3> color, InOut<float, -1, -1> total, InOut<float, -1, -1> confidence,
+                int threads) {
     const size_t height = z.shape(0), width = z.shape(1);
     const auto fits = [&](const auto& other) { return other.shape(0) == height && other.shape(1) == width; };
     if (!fits(surface) || !fits(color) || !fits(total) || !fits(confidence))
@@ -143,9 +121,11 @@ void blend_view(Grid2 z, Mask surface, Bytes image, Counts depth, float step, Ma
                         static_cast<int>(image.shape(0)), {}, {}, trust, weight};
     std::copy(A.data(), A.data() + 9, view.A);
     std::copy(b.data(), b.data() + 3, view.b);
-    const nb::gil_scoped_release release;
-    sf::blend_view(z.data(), surface.data(), static_cast<int>(width), static_cast<int>(height), view,
-                   {rules[0], rules[1], rules[2], rules[3]}, color.data(), total.data(), confidence.data(), threads);
+    alone([&] {
+        sf::blend_view(z.data(), surface.data(), static_cast<int>(width), static_cast<int>(height), view,
+                       {rules[0], rules[1], rules[2], rules[3]}, color.data(), total.data(), confidence.data(),
+                       threads);
+    });
 }
 
 // A network of Python arrays, checked and kept alive.
@@ -201,13 +181,11 @@ struct Network {
             inputs = layer.outputs;
         }
         if (inputs != 3) throw nb::value_error("the last layer must have three outputs");
-        bool good;
-        {
-            nb::gil_scoped_release release;
+        const bool good = alone([&] {
             std::vector<std::shared_lock<std::shared_mutex>> reading;
             for (const sf::FieldLevel& level : net.levels) reading.emplace_back(level.grid->mutex());
-            good = decode(net);
-        }
+            return decode(net);
+        });
         if (!good) throw nb::index_error("a query is not finite or lies too far from the origin");
     }
 };
@@ -218,43 +196,23 @@ Out<float> decode_colors(Points queries, nb::list levels, nb::list layers, int n
     Network network(levels, layers, neighbours, base, degree);
     const size_t n = queries.shape(0);
     if (extra) network.add_extra(*extra, n);
-    std::unique_ptr<float[]> colors(new float[3 * n]);
+    Made<float> colors({n, 3});
     network.run([&](const sf::ColorNetwork& net) {
         return sf::decode_colors(net, queries.data(), n, eye ? eye->data() : nullptr, colors.get(), threads);
     });
-    return give(std::move(colors), {n, 3});
+    return colors.give();
 }
 
 Out<float> decode_image(Image positions, Matrix4 T_map_camera, nb::list levels, nb::list layers, int neighbours,
                         int degree, std::optional<Rows> base, int threads) {
     Network network(levels, layers, neighbours, base, degree);
     const size_t h = positions.shape(0), w = positions.shape(1);
-    std::unique_ptr<float[]> colors(new float[3 * h * w]);
+    Made<float> colors({h, w, 3});
     network.run([&](const sf::ColorNetwork& net) {
         return sf::decode_image(net, positions.data(), h, w, T_map_camera.data(), colors.get(), threads);
     });
-    return give(std::move(colors), {h, w, 3});
+    return colors.give();
 }
-
-// An image to be filled when it is wanted, else nothing.
-template <class T>
-struct Wanted {
-    std::unique_ptr<T[]> data;
-    std::vector<size_t> shape;
-
-    Wanted(bool wanted, std::vector<size_t> shape_) : shape(std::move(shape_)) {
-        size_t size = 1;
-        for (const size_t extent : shape) size *= extent;
-        if (wanted) data.reset(new T[size]);
-    }
-
-    nb::object array() {
-        if (!data) return nb::none();
-        T* raw = data.release();
-        nb::capsule owner(raw, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-        return nb::cast(Out<T>(raw, shape.size(), shape.data(), owner));
-    }
-};
 
 nb::tuple rasterize(Points points, Matrix4 T_camera_map, float fx, float fy, float cx, float cy, int width, int height,
                     float radius, float near, float max_half, int k_ray, float layer_gap, float sigma,
@@ -270,14 +228,14 @@ nb::tuple rasterize(Points points, Matrix4 T_camera_map, float fx, float fy, flo
         spec.translation[i] = T_camera_map(i, 3);
     }
     const size_t w = width, h = height, k = k_ray;
-    Wanted<float> z(true, {h, w}), xyz(position, {h, w, 3}), weights(weight, {h, w, k}), n(normal, {h, w, 3});
-    Wanted<int32_t> ids(index, {h, w, k});
-    {
-        nb::gil_scoped_release release;
+    Made<float> z({h, w}), xyz({h, w, 3}, position), weights({h, w, k}, weight), n({h, w, 3}, normal);
+    Made<int32_t> ids({h, w, k}, index);
+    alone([&] {
         sf::rasterize(points.data(), normals ? normals->data() : nullptr, points.shape(0), spec,
-                      {z.data.get(), xyz.data.get(), ids.data.get(), weights.data.get(), n.data.get()});
-    }
-    return nb::make_tuple(z.array(), xyz.array(), ids.array(), weights.array(), n.array());
+                      {z.get(), xyz.get(), ids.get(), weights.get(), n.get()});
+    });
+    return nb::make_tuple(z.give(), xyz.give_if_wanted(), ids.give_if_wanted(), weights.give_if_wanted(),
+                          n.give_if_wanted());
 }
 
 }  // namespace

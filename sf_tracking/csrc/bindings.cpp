@@ -1,12 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 // Python module sf_tracking._native: arrays in, arrays out. Bad shapes are a TypeError or a ValueError.
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
+#include <sf_native/arrays.hpp>
 
 #include <algorithm>
-#include <initializer_list>
-#include <memory>
-#include <vector>
 
 #include "align.hpp"
 #include "bundle.hpp"
@@ -18,40 +14,7 @@ namespace nb = nanobind;
 
 namespace {
 
-template <class T, nb::ssize_t... N>
-using In = nb::ndarray<const T, nb::shape<N...>, nb::c_contig, nb::device::cpu>;
-template <class T>
-using Out = nb::ndarray<nb::numpy, T>;
-
-// An array that Python will own.
-template <class T>
-struct Made {
-    std::unique_ptr<T[]> data;
-    std::vector<size_t> shape;
-
-    explicit Made(std::initializer_list<size_t> shape_) : shape(shape_) {
-        size_t size = 1;
-        for (const size_t extent : shape) size *= extent;
-        data.reset(new T[size]);
-    }
-    T* get() { return data.get(); }
-    Out<T> give() {
-        T* raw = data.release();
-        nb::capsule owner(raw, [](void* p) noexcept { delete[] static_cast<T*>(p); });
-        return Out<T>(raw, shape.size(), shape.data(), owner);
-    }
-};
-
-// Kernels work on plain memory: other Python threads run meanwhile.
-template <class Work>
-void alone(Work work) {
-    nb::gil_scoped_release released;
-    work();
-}
-
-void require(bool good, const char* what) {
-    if (!good) throw nb::value_error(what);
-}
+using sf::alone, sf::In, sf::Made, sf::Out, sf::require;
 
 sf::Image image_of(const In<float, -1, -1>& grey) {
     require(grey.shape(0) > 0 && grey.shape(1) > 0 && grey.shape(0) < 32768 && grey.shape(1) < 32768,
