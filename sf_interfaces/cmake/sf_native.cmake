@@ -2,11 +2,12 @@
 # sf_native_package([OPTIONS flag...]): the Python package in this folder with its compiled module _native, built from
 # csrc/*.cpp. The target is called ${PROJECT_NAME}_native.
 function(sf_native_package)
+  find_package(ament_cmake_python REQUIRED)
+  ament_get_python_install_dir(site_packages)
   cmake_parse_arguments(arg "" "" "OPTIONS" ${ARGN})
   if(NOT CMAKE_BUILD_TYPE AND NOT CMAKE_CONFIGURATION_TYPES)
     set(CMAKE_BUILD_TYPE Release CACHE STRING "" FORCE)
   endif()
-  find_package(ament_cmake_python REQUIRED)
   # nanobind asks for Python, ament for Python3: both must be the same interpreter.
   find_package(Python3 REQUIRED COMPONENTS Interpreter Development.Module)
   set(Python_EXECUTABLE "${Python3_EXECUTABLE}")
@@ -30,7 +31,7 @@ function(sf_native_package)
   set(flags -O3 -Wall -Wextra -Wno-psabi -ffp-contract=off ${arg_OPTIONS})
   target_compile_options(${PROJECT_NAME}_native PRIVATE "$<$<COMPILE_LANGUAGE:CXX>:${flags}>")
 
-  install(TARGETS ${PROJECT_NAME}_native LIBRARY DESTINATION "${PYTHON_INSTALL_DIR}/${PROJECT_NAME}")
-  install(DIRECTORY . DESTINATION "${PYTHON_INSTALL_DIR}/${PROJECT_NAME}" FILES_MATCHING
+  install(TARGETS ${PROJECT_NAME}_native LIBRARY DESTINATION "${site_packages}/${PROJECT_NAME}")
+  install(DIRECTORY . DESTINATION "${site_packages}/${PROJECT_NAME}" FILES_MATCHING
     PATTERN "*.py" PATTERN "py.typed" PATTERN "csrc" EXCLUDE)
 endfunction()
