@@ -24,7 +24,7 @@ from paper import PAPER
 
 from sf_bringup import measures
 from sf_bringup.evaluation import trajectory_error
-from sf_bringup.evaluation.image import Lpips
+from sf_bringup.evaluation.lpips import Lpips
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.simulate import PRESETS, SimulationSpec, Simulator
 from sf_interfaces.errors import SceneFactoryError

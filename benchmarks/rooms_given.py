@@ -21,7 +21,7 @@ from common import Benchmark, mean_row, print_rows, run_line, shrunk, simulated,
 from sf_bringup import measures
 from sf_bringup.eval_files import read_surface
 from sf_bringup.evaluation import surface_error
-from sf_bringup.evaluation.image import Lpips
+from sf_bringup.evaluation.lpips import Lpips
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.simulate import PRESETS
 from sf_interfaces.errors import SceneFactoryError

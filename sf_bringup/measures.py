@@ -25,7 +25,7 @@ from sf_bringup.evaluation import (
     surface_error,
     trajectory_error,
 )
-from sf_bringup.evaluation.image import Lpips
+from sf_bringup.evaluation.lpips import Lpips
 from sf_bringup.evaluation.mesh import icp
 from sf_bringup.evaluation.robust_mvd import mvd_error
 from sf_bringup.evaluation.seen_surface import seen_surface_error

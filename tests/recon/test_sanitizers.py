@@ -36,7 +36,16 @@ def test_hostile_input_under_the_sanitizers(block: str, tmp_path: Path) -> None:
     csrc, program = ROOT / f"sf_{block}" / "csrc", tmp_path / "kernels_test"
     sources = [str(ROOT / "tests" / block / "csrc" / "kernels_test.cpp")]
     sources += [str(csrc / f"{name}.cpp") for name in KERNELS[block]]
-    build = ["g++", *FLAGS, *SANITIZERS, f"-I{csrc}", f"-I{ROOT / 'sf_interfaces' / 'include'}", *sources, "-o", str(program)]
+    build = [
+        "g++",
+        *FLAGS,
+        *SANITIZERS,
+        f"-I{csrc}",
+        f"-I{ROOT / 'sf_interfaces' / 'include'}",
+        *sources,
+        "-o",
+        str(program),
+    ]
     subprocess.run(build, check=True, capture_output=True, text=True)
     run = subprocess.run([str(program)], capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
