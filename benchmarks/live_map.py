@@ -1,6 +1,6 @@
 """A map of half a million points that is looked at while it learns: steps, frames a second, time to a PSNR, memory.
 
-    python benchmarks/live_map.py --data FOLDER [--resolution 0.006] [--seconds 4]
+    python benchmarks/live_map.py --data FOLDER [--resolution 0.006] [--seconds 4] [--device cuda]
 
 FOLDER holds ``rgbd_7scenes_*``. All keyframes but the last are placed and trained as a line does it. Then: optimiser
 steps a second of the trainer alone; frames a second at 640x480 from the poses of held-out frames, with the JPEG of
@@ -20,12 +20,14 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from colour import load
 from common import Benchmark, print_rows
 
 from sf_bringup.evaluation import psnr
 from sf_interfaces.types import Keyframe
 from sf_recon.config import ReconConfig
+from sf_recon.core.device import DEVICES
 from sf_recon.core.learner import FairLock, Learner
 from sf_recon.core.memory import points_bytes
 from sf_recon.core.reconstruction import Reconstruction
@@ -88,12 +90,13 @@ def main() -> None:
     bench.parser.add_argument("--frames", type=int, default=200)
     bench.parser.add_argument("--step", type=int, default=8, help="every n-th frame is a keyframe")
     bench.parser.add_argument("--seconds", type=float, default=4.0, help="of each measurement")
+    bench.parser.add_argument("--device", default="cpu", choices=DEVICES, help="where the map is drawn and learnt")
     args = bench.parse()
     recording = next(iter(sorted(args.data.glob("rgbd_7scenes_*"))), None)
     if recording is None:
         bench.parser.error(f"{args.data} holds no rgbd_7scenes_* folder")
     keys, held = load(recording, args.frames, args.step)
-    built = Reconstruction(ReconConfig(resolution=args.resolution, iterations=10))
+    built = Reconstruction(ReconConfig(resolution=args.resolution, iterations=10, device=args.device))
     for key in keys[:-LAST]:
         built.add(key)
     assert built.points is not None
@@ -107,6 +110,7 @@ def main() -> None:
     learner.stop()
     finest = len(built.points.levels[0])
     row = {
+        "device": torch.cuda.get_device_name() if args.device == "cuda" else "CPU",
         "points": finest,
         "steps / s": steps,
         "frames / s, map rests": paused,

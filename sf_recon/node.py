@@ -51,7 +51,9 @@ class ReconNode(BlockNode):
         """The reconstruction and its keyframes."""
         self.leader = ""
         saved = self.snapshot("recon.sfmap")
-        self._reconstruction = Reconstruction(self.config()) if saved is None else Reconstruction.load(saved)
+        self._reconstruction = (
+            Reconstruction(self.config()) if saved is None else Reconstruction.load(saved, self.config().device)
+        )
         self._source = KeyframeSource(self, landmarks=False)
         self._source.announces({"image", "camera_info", "pose", "state", "depth"})
         self._unsaved, self._resumed, self._saved_s = 0, saved is not None, time.monotonic()

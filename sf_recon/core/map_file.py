@@ -66,14 +66,14 @@ def write(
 ) -> None:
     """Write points, features, network, keyframes, configuration. Images and depth are packed without loss."""
     field = trainer.field
-    arrays = {f"network.{k}": v.numpy() for k, v in field.network.state_dict().items()}
+    arrays = {f"network.{k}": v.cpu().numpy() for k, v in field.network.state_dict().items()}
     arrays["keyframe.stamps"] = np.array(list(poses), np.int64)
     arrays["keyframe.poses"] = np.array(list(poses.values())).reshape(-1, 4, 4)
     arrays["keyframe.units"] = np.array(units, np.float64)
     for i, (level, features) in enumerate(zip(points.levels, field.features, strict=True)):
         arrays |= {f"level{i}.points": level.points, f"level{i}.sigmas": level.sigmas}
         arrays[f"level{i}.runs"] = np.array(level.runs, np.int64).reshape(-1, 2)
-        arrays[f"level{i}.features"] = features.numpy()
+        arrays[f"level{i}.features"] = features.cpu().numpy()
     for i, view in enumerate(trainer.views):
         arrays |= {f"view{i}.image": _packed(view.image), f"view{i}.z": _packed(view.z)}
         if view.weights is not None:
@@ -122,7 +122,7 @@ def restore(saved: SavedMap, points: NeuralPoints, trainer: Trainer) -> None:
         for i, level in enumerate(points.levels):
             runs = [(int(stamp), int(count)) for stamp, count in a[f"level{i}.runs"]]
             level.replace(a[f"level{i}.points"], a[f"level{i}.sigmas"], runs)
-            field.features[i] = torch.from_numpy(a[f"level{i}.features"])
+            field.features[i] = field.sent(a[f"level{i}.features"])
         state = {k.removeprefix("network."): torch.from_numpy(v) for k, v in a.items() if k.startswith("network.")}
         field.network.load_state_dict(state)
         for i, v in enumerate(saved.views):

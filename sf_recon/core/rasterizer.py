@@ -11,6 +11,7 @@ import numpy as np
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.types import Camera, Float32, Float64
 from sf_recon.config import ReconConfig
+from sf_recon.core.device import torch_device
 from sf_recon.core.ipr_reference import OUTPUTS, Raster, RasterOptions, rasterize_reference
 from sf_recon.core.native import native
 from sf_recon.core.rasterizer_cuda import CudaRasterizer
@@ -66,15 +67,16 @@ def rasterize(
 
 
 def make_rasterizer(config: ReconConfig) -> Rasterizer:
-    """The rasteriser that ``config.rasterizer`` names.
+    """The rasteriser that ``config.rasterizer`` names, on ``config.device``.
 
     Raises:
-        ConfigError: another name, or cuda without its kernels or a device.
+        ConfigError: another name, or a device that is not to be had.
     """
+    device = torch_device(config.device)
     if config.rasterizer == "reference":
         return rasterize_reference
     if config.rasterizer == "native":
-        return partial(rasterize, threads=config.threads)
-    if config.rasterizer == "cuda":
-        return CudaRasterizer().draw
-    raise ConfigError(f"recon.rasterizer must be native, cuda or reference, got '{config.rasterizer}'")
+        return (
+            CudaRasterizer(device.index).draw if device.type == "cuda" else partial(rasterize, threads=config.threads)
+        )
+    raise ConfigError(f"recon.rasterizer must be native or reference, got '{config.rasterizer}'")

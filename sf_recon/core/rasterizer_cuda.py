@@ -11,12 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sf_interfaces.errors import ConfigError
 from sf_interfaces.types import Camera, Float32, Float64
+from sf_recon.core.device import cuda_kernels
 from sf_recon.core.ipr_reference import Raster, RasterOptions
-from sf_recon.core.native import native
 
-HOW_TO_BUILD = "build it with the CUDA toolkit: pip install . -Ccmake.define.SF_CUDA=ON"
 KEPT = 8  # clouds that stay on the device from view to view: those of the levels of a map
 
 
@@ -28,15 +26,8 @@ class CudaRasterizer:
     """
 
     def __init__(self, device: int = 0) -> None:
-        module = native()
-        if not hasattr(module, "CudaRasterizer"):
-            raise ConfigError(f"the compiled kernels have no CUDA rasteriser; {HOW_TO_BUILD}")
-        if not torch.cuda.is_available():
-            raise ConfigError(
-                "torch finds no CUDA device: install a CUDA build of torch, or set recon.rasterizer=native"
-            )
         self._device = torch.device("cuda", device)
-        self._kernel: Any = module.CudaRasterizer(device)
+        self._kernel: Any = cuda_kernels().CudaRasterizer(device)
         self._clouds: deque[tuple[Float32, Tensor]] = deque(maxlen=KEPT)
 
     def rasterize(

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, Po
 from sf_recon.config import MESHES, ReconConfig
 from sf_recon.core import map_file, memory, products
 from sf_recon.core.color_field import ColorField
+from sf_recon.core.device import torch_device
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.neural_points import NeuralPoints
 from sf_recon.core.observation import Observation, auto_resolution, observe, rgb
@@ -39,7 +41,7 @@ class Reconstruction:
     """
 
     def __init__(self, config: ReconConfig) -> None:
-        make_rasterizer(config)  # a wrong name is an error now, not at the first keyframe
+        make_rasterizer(config)  # a wrong name or device is an error now, not at the first keyframe
         if config.mesh not in MESHES:
             raise ConfigError(f"recon.mesh must be one of {', '.join(MESHES)}, got '{config.mesh}'")
         self.config = config
@@ -189,14 +191,17 @@ class Reconstruction:
         return products.save_products(self, folder)
 
     @staticmethod
-    def load(path: Path) -> Reconstruction:
+    def load(path: Path, device: str = "cpu") -> Reconstruction:
         """Read a map written by :meth:`save`; it can be drawn at once and grown by further keyframes.
+
+        Args:
+            device: where it is drawn and learnt from now on, cpu or cuda.
 
         Raises:
             FormatError: not a map of this version.
         """
         saved = map_file.read(path)
-        out = Reconstruction(saved.config)
+        out = Reconstruction(replace(saved.config, device=device))
         out._start(saved.resolution)
         out.scale, out.poses, out.units = saved.scale, saved.poses, saved.units
         map_file.restore(saved, out._points, out._trainer)  # type: ignore[arg-type]
@@ -215,6 +220,7 @@ class Reconstruction:
             view_directions=c.view_directions,
             threads=c.threads,
             generator=torch.Generator().manual_seed(c.seed),
+            device=torch_device(c.device),
         )
         self._renderer = Renderer(c, self._points, self._field)
         self._trainer = Trainer(

@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sf_recon.core.color_field import ColorField, Neighbourhood
+from sf_recon.core.color_field import CPU, ColorField, Neighbourhood
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.native import native
 
 BETAS = (0.9, 0.99)
 EPSILON = 1e-3  # about the gradient of one grey level: smaller ones are noise, which Adam must not blow up
 JUMP_FACTOR = 10.0
+MOST_STEPS = 4096  # counted; from then on the bias corrections are 1
+_HALF_LEAST, _HALF_MOST = 1e-7, 6e4  # of a moment, so that half precision holds it
 BLIND = 4  # every so many pixels learns the colour seen from no side, which the exported surface shows
 
 
@@ -29,10 +31,10 @@ class RowAdam:
     every time this is Adam, up to the rounding of the moments.
     """
 
-    def __init__(self, columns: int) -> None:
-        self.mean = torch.zeros(0, columns, dtype=torch.float16)
-        self.root = torch.zeros(0, columns, dtype=torch.float16)
-        self.steps = torch.zeros(0, dtype=torch.int16)
+    def __init__(self, columns: int, device: torch.device = CPU) -> None:
+        self.mean = torch.zeros(0, columns, dtype=torch.float16, device=device)
+        self.root = torch.zeros(0, columns, dtype=torch.float16, device=device)
+        self.steps = torch.zeros(0, dtype=torch.int16, device=device)
 
     def grow(self, rows: int) -> None:
         """Extend to a table of ``rows``; the moments of the old rows stay."""
@@ -44,7 +46,7 @@ class RowAdam:
 
     def keep(self, kept: np.ndarray) -> None:
         """Keep only the rows of a mask."""
-        mask = torch.from_numpy(kept)
+        mask = torch.from_numpy(kept).to(self.steps.device)
         self.mean, self.root, self.steps = self.mean[mask], self.root[mask], self.steps[mask]
 
     @property
@@ -54,7 +56,9 @@ class RowAdam:
 
     def step(self, table: Tensor, near: Neighbourhood, gradient: Tensor, rate: float, threads: int = 0) -> None:
         """Move the rows that were interpolated, given the loss gradient [N, C] of the interpolated values."""
-        native().adam_rows(
+        if table.is_cuda:
+            return self.step_by_torch(table, near, gradient, rate)
+        return native().adam_rows(
             near.ids.numpy(),
             near.weights.numpy(),
             gradient.contiguous().numpy(),
@@ -67,6 +71,21 @@ class RowAdam:
             EPSILON,
             threads,
         )
+
+    def step_by_torch(self, table: Tensor, near: Neighbourhood, gradient: Tensor, rate: float) -> None:
+        """The same on any device. A GPU sums in an order of its own, so that last bits differ from run to run."""
+        used = near.weights > 0
+        rows, number = near.ids[used].long().unique(return_inverse=True)
+        parts = (near.weights[..., None] * gradient[:, None])[used]  # [M, C]
+        g = torch.zeros(len(rows), parts.shape[1], device=parts.device).index_add_(0, number, parts)
+        steps = (self.steps[rows] + 1).clamp(max=MOST_STEPS)
+        t, (beta1, beta2) = steps[:, None].float(), BETAS
+        mean = beta1 * self.mean[rows].float() + (1 - beta1) * g
+        square = beta2 * self.root[rows].float().square() + (1 - beta2) * g.square()
+        table[rows] -= rate / (1 - beta1**t) * mean / ((square / (1 - beta2**t)).sqrt() + EPSILON)
+        self.steps[rows] = steps
+        self.mean[rows] = mean.clamp(-_HALF_MOST, _HALF_MOST).half()
+        self.root[rows] = square.sqrt().clamp(_HALF_LEAST, _HALF_MOST).half()
 
 
 class Trainer:
@@ -88,7 +107,7 @@ class Trainer:
         self.views: list[KeyframeView] = []
         self.iteration = 0
         self.losses: list[float] = []
-        self.rows = [RowAdam(f.shape[1]) for f in field.features]
+        self.rows = [RowAdam(f.shape[1], field.device) for f in field.features]
         self._network = torch.optim.Adam(field.network.parameters(), lr=network_rate, betas=BETAS, eps=EPSILON)
 
     def add(self, view: KeyframeView) -> None:
@@ -114,8 +133,8 @@ class Trainer:
         samples.directions[::BLIND] = 0.0
         near = self.field.neighbourhoods(samples.points)
         encoded = self.field.encode(near).requires_grad_(True)
-        error = self.field.decode(encoded, near, samples.directions) - torch.from_numpy(samples.colors)
-        loss = (torch.from_numpy(samples.weights)[:, None] * error.square()).mean()
+        error = self.field.decode(encoded, near, samples.directions) - self.field.sent(samples.colors)
+        loss = (self.field.sent(samples.weights)[:, None] * error.square()).mean()
         self._network.zero_grad()
         # Adam does not see the scale of a loss; the sum keeps small gradients out of the denormal range.
         (loss * self.pixels).backward()  # type: ignore[no-untyped-call]

@@ -1,18 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
-// The CUDA sibling in Python: DLPack arrays on one device in, images into arrays that the caller has allocated there.
+// The CUDA siblings in Python: DLPack arrays on one device in, results into arrays that the caller has allocated there.
 #ifdef SF_CUDA
-#include <nanobind/nanobind.h>
-#include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
+#include <sf_native/arrays.hpp>
 
+#include "grid_cuda.hpp"
 #include "ipr_cuda.hpp"
 
 namespace nb = nanobind;
 
 namespace {
 
-using Matrix4 = nb::ndarray<const float, nb::shape<4, 4>, nb::c_contig, nb::device::cpu>;
+using sf::alone, sf::require;
+using Matrix4 = sf::In<float, 4, 4>;
 using Points = nb::ndarray<const float, nb::shape<-1, 3>, nb::c_contig, nb::device::cuda>;
+template <class T>
+using Found = nb::ndarray<T, nb::shape<-1, -1>, nb::c_contig, nb::device::cuda>;
 template <class T>
 using Image = std::optional<nb::ndarray<T, nb::c_contig, nb::device::cuda>>;
 
@@ -46,9 +49,30 @@ void rasterize(sf::CudaRasterizer& rasterizer, Points points, Matrix4 T_camera_m
     const sf::RasterImages out{data_of(depth, pixels, 1, device), data_of(position, pixels, 3, device),
                                data_of(index, pixels, k, device), data_of(weight, pixels, k, device),
                                data_of(normal, pixels, 3, device)};
-    nb::gil_scoped_release release;
-    rasterizer.rasterize(points.data(), normals ? normals->data() : nullptr, points.shape(0), spec, out,
-                         reinterpret_cast<void*>(stream));
+    alone([&] {
+        rasterizer.rasterize(points.data(), normals ? normals->data() : nullptr, points.shape(0), spec, out,
+                             reinterpret_cast<void*>(stream));
+    });
+}
+
+void build(sf::CudaGrid& grid, Points points, uintptr_t stream) {
+    require(points.device_id() == grid.device(), "the points lie on another device");
+    require(points.shape(0) <= 2000000000, "at most 2e9 points");
+    alone([&] { grid.build(points.data(), points.shape(0), reinterpret_cast<void*>(stream)); });
+}
+
+void knn(const sf::CudaGrid& grid, Points queries, float radius, Found<int32_t> ids, Found<float> distance2,
+         uintptr_t stream) {
+    const size_t n = queries.shape(0), k = ids.shape(1);
+    require(k >= 1 && k <= sf::kMaxDeviceNeighbours && radius > 0, "knn needs 1 <= k <= 16 and a radius > 0");
+    require(ids.shape(0) == n && distance2.shape(0) == n && distance2.shape(1) == k, "one row for each query");
+    require(queries.device_id() == grid.device() && ids.device_id() == grid.device() &&
+                distance2.device_id() == grid.device(),
+            "queries and outputs lie on another device");
+    alone([&] {
+        grid.knn(queries.data(), n, static_cast<int>(k), radius, ids.data(), distance2.data(),
+                 reinterpret_cast<void*>(stream));
+    });
 }
 
 }  // namespace
@@ -61,5 +85,11 @@ void bind_cuda(nb::module_& m) {
              nb::arg("max_half"), nb::arg("k_ray"), nb::arg("layer_gap"), nb::arg("sigma"), nb::arg("normals").none(),
              nb::arg("depth"), nb::arg("position").none(), nb::arg("index").none(), nb::arg("weight").none(),
              nb::arg("normal").none(), nb::arg("stream"));
+    nb::class_<sf::CudaGrid>(m, "CudaGrid")
+        .def(nb::init<int, float>(), nb::arg("device"), nb::arg("cell_size"))
+        .def("__len__", &sf::CudaGrid::size)
+        .def("build", &build, nb::arg("points"), nb::arg("stream"))
+        .def("knn", &knn, nb::arg("queries"), nb::arg("radius"), nb::arg("ids"), nb::arg("distance2"),
+             nb::arg("stream"));
 }
 #endif

@@ -7,8 +7,8 @@
 
 #include <cub/cub.cuh>
 #include <stdexcept>
-#include <string>
 
+#include "cuda_memory.hpp"
 #include "ipr_window.hpp"
 
 namespace sf {
@@ -17,48 +17,6 @@ namespace {
 constexpr int kThreads = kTile * kTile;
 constexpr int kDepthBits = 31;  // of a positive float
 constexpr float kMinStep = 1e-5f, kMinSine = 1e-2f;  // as on the CPU
-
-void check(cudaError_t error, const char* what) {
-    if (error != cudaSuccess) throw std::runtime_error(std::string(what) + ": " + cudaGetErrorString(error));
-}
-
-class DeviceGuard {
-   public:
-    explicit DeviceGuard(int device) {
-        check(cudaGetDevice(&before_), "cudaGetDevice");
-        check(cudaSetDevice(device), "cudaSetDevice");
-    }
-    ~DeviceGuard() { cudaSetDevice(before_); }
-    DeviceGuard(const DeviceGuard&) = delete;
-    DeviceGuard& operator=(const DeviceGuard&) = delete;
-
-   private:
-    int before_ = 0;
-};
-
-class Buffer {
-   public:
-    Buffer() = default;
-    Buffer(const Buffer&) = delete;
-    Buffer& operator=(const Buffer&) = delete;
-    ~Buffer() { cudaFree(data_); }
-
-    template <class T>
-    T* reserve(size_t count) {
-        if (count * sizeof(T) > bytes_) {
-            check(cudaFree(data_), "cudaFree");
-            data_ = nullptr, bytes_ = 0;
-            const size_t wanted = count * sizeof(T) + count * sizeof(T) / 4;
-            check(cudaMalloc(&data_, wanted), "cudaMalloc");
-            bytes_ = wanted;
-        }
-        return static_cast<T*>(data_);
-    }
-
-   private:
-    void* data_ = nullptr;
-    size_t bytes_ = 0;
-};
 
 __device__ __forceinline__ float hole() { return __int_as_float(0x7fc00000); }
 

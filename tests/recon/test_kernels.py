@@ -167,6 +167,21 @@ def test_adam_moves_touched_rows_as_torch_does() -> None:
     assert np.flatnonzero((table != before).any(dim=1)).tolist() == [0] and rows.steps.tolist() == [31, *[30] * 39]
 
 
+def test_adam_in_torch_operations_equals_the_kernel() -> None:
+    rng = np.random.default_rng(3)
+    tables, rows = [torch.zeros(60, 6) for _ in range(2)], [RowAdam(6) for _ in range(2)]
+    for one in rows:
+        one.grow(60)
+    for _ in range(20):
+        ids = rng.integers(0, 50, (40, 4)).astype(np.int32)  # many twice, some never
+        near = near_of(ids, (rng.uniform(0, 1, (40, 4)) * (rng.random((40, 4)) < 0.8)).astype(np.float32))
+        gradient = torch.from_numpy(rng.normal(size=(40, 6)).astype(np.float32))
+        rows[0].step(tables[0], near, gradient, 0.01)
+        rows[1].step_by_torch(tables[1], near, gradient, 0.01)
+    assert torch.equal(rows[0].steps, rows[1].steps) and not tables[1][50:].any()
+    np.testing.assert_allclose(tables[1], tables[0], atol=1e-3 * float(tables[0].abs().max()))  # moments have 11 bits
+
+
 @given(value=st.floats(-7e4, 7e4, width=32), steps=st.integers(0, 9))
 @settings(max_examples=300, deadline=None)
 def test_moments_are_rounded_to_the_nearest_half(value: float, steps: int) -> None:

@@ -192,5 +192,7 @@ def test_position_lies_on_its_ray_and_at_its_pixel_centre() -> None:
 
 def test_rasteriser_is_chosen_by_name() -> None:
     assert make_rasterizer(ReconConfig(rasterizer="reference")) is rasterize_reference
-    with pytest.raises(ConfigError, match="native, cuda or reference"):
+    with pytest.raises(ConfigError, match="native or reference"):
         make_rasterizer(ReconConfig(rasterizer="vulkan"))
+    with pytest.raises(ConfigError, match="cpu or cuda"):
+        make_rasterizer(ReconConfig(device="tpu"))

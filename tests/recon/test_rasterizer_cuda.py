@@ -33,10 +33,11 @@ needs_gpu = pytest.mark.skipif(
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("nvcc") is None, reason="no CUDA compiler (nvcc)")
 @pytest.mark.parametrize("architecture", ["75", "120"])  # the oldest and the newest that the build lists
-def test_it_compiles(architecture: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("source", ["ipr_cuda", "grid_cuda"])
+def test_it_compiles(source: str, architecture: str, tmp_path: Path) -> None:
     command = ["nvcc", "-std=c++17", "-O1", "-fmad=false", "-Werror", "all-warnings", "-Xcompiler=-Wall,-fPIC"]
     code = f"arch=compute_{architecture},code=sm_{architecture}"
-    command += ["-gencode", code, "-c", str(CSRC / "ipr_cuda.cu"), "-o", str(tmp_path / "ipr_cuda.o")]
+    command += ["-gencode", code, "-c", str(CSRC / f"{source}.cu"), "-o", str(tmp_path / "kernels.o")]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     if "Unsupported gpu architecture" in run.stderr:
         pytest.skip(f"this nvcc does not know sm_{architecture}")
@@ -46,7 +47,7 @@ def test_it_compiles(architecture: str, tmp_path: Path) -> None:
 @pytest.mark.skipif(BUILT, reason="the kernels are built with CUDA")
 def test_without_cuda_it_says_how_to_build() -> None:
     with pytest.raises(ConfigError, match="SF_CUDA=ON"):
-        make_rasterizer(ReconConfig(rasterizer="cuda"))
+        make_rasterizer(ReconConfig(device="cuda"))
 
 
 @needs_gpu
@@ -74,7 +75,7 @@ def test_it_equals_the_cpu(name: str, with_normals: bool) -> None:
 @settings(max_examples=200, deadline=None)
 @ANY_CLOUD
 def test_it_equals_the_definition_on_any_cloud(**case: Any) -> None:
-    assert_equals_definition(make_rasterizer(ReconConfig(rasterizer="cuda")), **case)
+    assert_equals_definition(make_rasterizer(ReconConfig(device="cuda")), **case)
 
 
 @needs_gpu
@@ -89,7 +90,7 @@ def test_streams_and_growing_clouds_share_one_workspace() -> None:
 
 @needs_gpu
 def test_clouds_of_the_cpu_are_sent_once_and_drawn_again_when_they_are_others() -> None:
-    draw = make_rasterizer(ReconConfig(rasterizer="cuda"))
+    draw = make_rasterizer(ReconConfig(device="cuda"))
     for name in ("dense", "scattered", "dense", "one", "empty", "dense"):
         drawn = draw(CLOUDS[name], CAMERA, POSE, OPTIONS, outputs=("position", "index"))
         expected = rasterize(CLOUDS[name], CAMERA, POSE, OPTIONS, outputs=("position", "index"))

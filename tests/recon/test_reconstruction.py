@@ -292,7 +292,7 @@ def test_empty_map_draws_holes() -> None:
 
 def test_gaussian_weights() -> None:
     d2 = np.array([[0.0, 1.0], [400.0, 401.0], [5.0, np.inf], [np.inf, np.inf]], np.float32)
-    w = gaussian_weights(d2, 1.0)
+    w = gaussian_weights(torch.from_numpy(d2), 1.0)
     e = np.exp(-1.0)
     np.testing.assert_allclose(w, [[1 / (1 + e), e / (1 + e)]] * 2 + [[1, 0], [0, 0]], rtol=1e-6)
 
