@@ -19,13 +19,13 @@ import torch
 from torch import Tensor
 
 from sf_interfaces.types import Float32, Float64
-from sf_recon.core.device import DeviceGrid
+from sf_recon.config import ReconConfig
+from sf_recon.core.device import DeviceGrid, torch_device
 from sf_recon.core.kernels import ColorNetwork, FieldLevel, decode_colors
 from sf_recon.core.neural_points import SEARCH_RADIUS, Added, NeuralPoints
 
 INITIAL_FEATURE = 0.5
 HARMONICS = 8  # real spherical harmonics of degrees 1 and 2, up to constants
-CPU = torch.device("cpu")
 _BATCH = 1 << 19  # queries that a GPU decodes at once
 _MARGIN = 0.02  # keeps the logit of a black or white colour finite
 
@@ -57,35 +57,24 @@ def harmonics(directions: Tensor) -> Tensor:
 class ColorField(torch.nn.Module):
     """Features of every neural point and the network that turns them into RGB in 0..1."""
 
-    def __init__(
-        self,
-        points: NeuralPoints,
-        *,
-        features: int,
-        hidden: int,
-        neighbours: int,
-        sigma: float,
-        view_directions: bool,
-        threads: int,
-        generator: torch.Generator,
-        device: torch.device = CPU,
-    ) -> None:
+    def __init__(self, points: NeuralPoints, config: ReconConfig) -> None:
         super().__init__()
-        self.points, self.device = points, device
-        self._grids = [DeviceGrid(level, device) for level in points.levels] if device.type == "cuda" else []
-        self.neighbours, self.sigma, self.threads = neighbours, sigma, threads
-        self.view_directions = view_directions
-        self.features = [torch.zeros(0, features, device=device) for _ in points.levels]
-        sizes = [features * len(points.levels) + HARMONICS * view_directions, hidden, hidden, 3]
+        self.points, self.device = points, torch_device(config.device)
+        self._grids = [DeviceGrid(level, self.device) for level in points.levels] if self.device.type == "cuda" else []
+        self.neighbours, self.sigma, self.threads = config.neighbours, config.sigma, config.threads
+        self.view_directions = config.view_directions
+        self.features = [torch.zeros(0, config.features, device=self.device) for _ in points.levels]
+        inputs = config.features * len(points.levels) + HARMONICS * config.view_directions
+        sizes, generator = [inputs, config.hidden, config.hidden, 3], torch.Generator().manual_seed(config.seed)
         layers: list[torch.nn.Module] = []
-        for inputs, outputs in pairwise(sizes):
-            linear = torch.nn.Linear(inputs, outputs)
+        for size, outputs in pairwise(sizes):
+            linear = torch.nn.Linear(size, outputs)
             torch.nn.init.xavier_uniform_(linear.weight, generator=generator)
             torch.nn.init.zeros_(linear.bias)
             layers += [linear, torch.nn.ReLU()]
         self.network = torch.nn.Sequential(*layers[:-1])
         torch.nn.init.zeros_(layers[-2].weight)  # type: ignore[arg-type]
-        self.network.to(device)
+        self.network.to(self.device)
 
     def grow(self, added: list[Added]) -> None:
         """New points start with their observed colour; the rest is their nearest older point's, or the initial one."""

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import ConfigError, FormatError
@@ -21,7 +20,6 @@ from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Keyframe, Po
 from sf_recon.config import MESHES, ReconConfig
 from sf_recon.core import map_file, memory, products
 from sf_recon.core.color_field import ColorField
-from sf_recon.core.device import torch_device
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.neural_points import NeuralPoints
 from sf_recon.core.observation import Observation, auto_resolution, observe, rgb
@@ -211,26 +209,9 @@ class Reconstruction:
         c = self.config
         self.resolution = resolution
         self._points = NeuralPoints(resolution, c.levels, c.multiplier)
-        self._field = ColorField(
-            self._points,
-            features=c.features,
-            hidden=c.hidden,
-            neighbours=c.neighbours,
-            sigma=c.sigma,
-            view_directions=c.view_directions,
-            threads=c.threads,
-            generator=torch.Generator().manual_seed(c.seed),
-            device=torch_device(c.device),
-        )
+        self._field = ColorField(self._points, c)
         self._renderer = Renderer(c, self._points, self._field)
-        self._trainer = Trainer(
-            self._field,
-            pixels=c.pixels,
-            feature_rate=c.feature_rate,
-            network_rate=c.network_rate,
-            jump_iterations=c.jump_iterations,
-            rng=self._rng,
-        )
+        self._trainer = Trainer(self._field, c, self._rng)
 
     def _merge(self, keyframe: Keyframe, seen: Observation) -> tuple[Float32, np.ndarray]:
         """Fuse with the surface drawn so far: (depth [M] m, mask [M] of the pixels that show new surface).

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sf_recon.core.color_field import CPU, ColorField, Neighbourhood
+from sf_recon.config import ReconConfig
+from sf_recon.core.color_field import ColorField, Neighbourhood
 from sf_recon.core.keyframe_view import KeyframeView
 from sf_recon.core.native import native
 
@@ -31,7 +32,7 @@ class RowAdam:
     every time this is Adam, up to the rounding of the moments.
     """
 
-    def __init__(self, columns: int, device: torch.device = CPU) -> None:
+    def __init__(self, columns: int, device: torch.device | None = None) -> None:
         self.mean = torch.zeros(0, columns, dtype=torch.float16, device=device)
         self.root = torch.zeros(0, columns, dtype=torch.float16, device=device)
         self.steps = torch.zeros(0, dtype=torch.int16, device=device)
@@ -91,24 +92,13 @@ class RowAdam:
 class Trainer:
     """Optimises the field on all keyframes seen so far."""
 
-    def __init__(
-        self,
-        field: ColorField,
-        *,
-        pixels: int,
-        feature_rate: float,
-        network_rate: float,
-        jump_iterations: int,
-        rng: np.random.Generator,
-    ) -> None:
-        self.field, self.pixels, self._rng = field, pixels, rng
-        self.feature_rate, self.jump_iterations = feature_rate, jump_iterations
-        self.network_rate = network_rate
+    def __init__(self, field: ColorField, config: ReconConfig, rng: np.random.Generator) -> None:
+        self.field, self.config, self._rng = field, config, rng
         self.views: list[KeyframeView] = []
         self.iteration = 0
         self.losses: list[float] = []
         self.rows = [RowAdam(f.shape[1], field.device) for f in field.features]
-        self._network = torch.optim.Adam(field.network.parameters(), lr=network_rate, betas=BETAS, eps=EPSILON)
+        self._network = torch.optim.Adam(field.network.parameters(), lr=config.network_rate, betas=BETAS, eps=EPSILON)
 
     def add(self, view: KeyframeView) -> None:
         """Take a new keyframe into the rotation."""
@@ -127,9 +117,9 @@ class Trainer:
             adam.grow(len(features))
         view = min(self.views, key=lambda v: v.turns)
         view.turns += 1
-        factor = JUMP_FACTOR if self.iteration < self.jump_iterations else 1.0
+        factor = JUMP_FACTOR if self.iteration < self.config.jump_iterations else 1.0
         self.iteration += 1
-        samples = view.sample(self.pixels, self._rng)
+        samples = view.sample(self.config.pixels, self._rng)
         samples.directions[::BLIND] = 0.0
         near = self.field.neighbourhoods(samples.points)
         encoded = self.field.encode(near).requires_grad_(True)
@@ -137,12 +127,12 @@ class Trainer:
         loss = (self.field.sent(samples.weights)[:, None] * error.square()).mean()
         self._network.zero_grad()
         # Adam does not see the scale of a loss; the sum keeps small gradients out of the denormal range.
-        (loss * self.pixels).backward()  # type: ignore[no-untyped-call]
+        (loss * self.config.pixels).backward()  # type: ignore[no-untyped-call]
         for group in self._network.param_groups:
-            group["lr"] = factor * self.network_rate
+            group["lr"] = factor * self.config.network_rate
         self._network.step()
         assert encoded.grad is not None
         gradients = torch.split(encoded.grad, [f.shape[1] for f in self.field.features], dim=1)
         for adam, table, n, gradient in zip(self.rows, self.field.features, near, gradients, strict=True):
-            adam.step(table, n, gradient, factor * self.feature_rate, self.field.threads)
+            adam.step(table, n, gradient, factor * self.config.feature_rate, self.field.threads)
         return view, float(loss.detach())

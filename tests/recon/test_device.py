@@ -56,21 +56,10 @@ def test_queries_that_are_nowhere_have_no_neighbours() -> None:
 
 def learnt(device: str, iterations: int) -> tuple[Trainer, Renderer]:
     """A room of four views, on which a field has been trained."""
-    config = ReconConfig(device=device, detail=0, sharpen=0)
+    config = ReconConfig(device=device, pixels=2048, detail=0, sharpen=0)
     points = NeuralPoints(0.02, 3, 4.0)
-    field = ColorField(
-        points,
-        features=6,
-        hidden=32,
-        neighbours=4,
-        sigma=1.0,
-        view_directions=True,
-        threads=0,
-        generator=torch.Generator().manual_seed(0),
-        device=torch_device(device),
-    )
-    rates = {"feature_rate": config.feature_rate, "network_rate": config.network_rate}
-    trainer = Trainer(field, pixels=2048, jump_iterations=5, rng=np.random.default_rng(0), **rates)
+    field = ColorField(points, config)
+    trainer = Trainer(field, config, np.random.default_rng(0))
     for index in range(0, 8, 2):
         key = view(index)
         assert key.depth is not None

@@ -11,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sf_recon.config import ReconConfig
 from sf_recon.core.color_field import ColorField, Neighbourhood
 from sf_recon.core.kernels import (
     ColorNetwork,
@@ -35,16 +36,7 @@ def surface(n: int, seed: int = 0) -> np.ndarray:
 
 def make_field(features: int = 8, view_directions: bool = False) -> ColorField:
     points = NeuralPoints(0.03, levels=3, multiplier=3.0)
-    field = ColorField(
-        points,
-        features=features,
-        hidden=20,
-        neighbours=4,
-        sigma=1.0,
-        view_directions=view_directions,
-        threads=0,
-        generator=torch.Generator().manual_seed(0),
-    )
+    field = ColorField(points, ReconConfig(features=features, hidden=20, view_directions=view_directions))
     cloud = surface(20000)
     field.grow(points.allocate(cloud, 0.5 + 0.4 * np.sin(cloud)))
     generator = torch.Generator().manual_seed(1)
