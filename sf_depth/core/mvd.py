@@ -140,7 +140,7 @@ class MultiViewDepth:
             matched = self._match(reference, sources, guess)
             at = fit.adjusted.estimate
             at = _triangulated(matched.seen, at.theta, at.T)
-            fit = self._check_and_adjust(matched.seen, at, size, not kept, free)
+            fit = self._check_and_adjust(matched.seen, at, size, not kept, free, T is None)
         if T is None:
             fit = self._with_lens(matched.seen, fit, size, free)
         if theta is not None and T is not None:
@@ -168,7 +168,9 @@ class MultiViewDepth:
         target, weight = (np.stack(part) for part in zip(*found, strict=True))
         return _Matched(target, weight, *_strided(target, weight, self._config.stride, size))
 
-    def _check_and_adjust(self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str) -> _Fit:
+    def _check_and_adjust(
+        self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str, stretch: bool = False
+    ) -> _Fit:
         """Dense BA over what passes the checks; both run again with the better geometry.
 
         Raises:
@@ -182,7 +184,7 @@ class MultiViewDepth:
                     "scene; give views that are a tenth of the distance to the scene apart"
                 )
             good = Observations(seen.uv, seen.target, weight)
-            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
+            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, stretch=stretch)
             at = found.estimate
         return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
 
@@ -194,14 +196,14 @@ class MultiViewDepth:
         bent = _BENT.get(free) if self._lens else None
         if bent is None:
             return fit
-        found = dense_ba.optimum(fit.seen, fit.adjusted.estimate, intrinsics=bent)
+        found = dense_ba.optimum(fit.seen, fit.adjusted.estimate, intrinsics=bent, stretch=True)
         if found.cost > (1.0 - _LENS) * fit.adjusted.cost:
             return fit
         if free == "f":
             deviation = dense_depth.focal_deviation(dense_ba.with_covariance(fit.seen, found, True, bent))
             if deviation > _SURE:
                 return fit
-        return self._check_and_adjust(seen, found.estimate, size, True, bent)
+        return self._check_and_adjust(seen, found.estimate, size, True, bent, True)
 
     def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
         """The fit with poses as given; None if they contradict the correspondences, or explain few of them."""
