@@ -30,6 +30,7 @@ _LEAST_SIGMA = 0.02  # px; correspondences are never better than this
 _FALL = 1e-4  # relative fall of the cost below which the iteration has converged
 _TILES = (9, 12)  # rows and columns of the tiles that count as independent in the covariance
 _STRETCH = 0.02  # what the prior of a stretch weighs: so much of the px^2 by which it moves a pixel at tangent 1
+_LEAST_TOLD = 1e-9  # of the surest combination of parameters; sums in single precision tell no less
 _LARGEST_STEP = 4.0  # factor by which one step may change an inverse depth
 
 
@@ -105,7 +106,7 @@ class Adjusted(Optimum):
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Normal equations: H [P, P] and g [P] of poses, stretches and intrinsics, C [N] and w [N] of depths, E [P, N] between.
+    """Normal equations: H [P, P] and g [P] of poses, stretches, intrinsics; C [N] and w [N] of depths; E [P, N] both.
 
     ``scores`` is what each pixel contributes to g, [P, N], where it was asked for.
     """
@@ -244,7 +245,7 @@ def step(system: System, damping: float) -> tuple[Float64, Float64]:
     """Damped step (dx [P], dd [N]); damping is relative to each diagonal, so it scales with the residuals."""
     C = system.C * np.float32(1.0 + damping) + least_information(system.C)
     S, b = kernels("sf_depth").eliminate(system.E, C, system.w, system.H, system.g)
-    S[np.diag_indices_from(S)] += damping * np.diag(system.H) + 1e-12 * np.trace(system.H)
+    S[np.diag_indices_from(S)] += damping * np.diag(system.H) + 1e-12 * np.trace(system.H) + 1e-300
     dx = np.linalg.solve(S, b) if len(S) else np.zeros(0)
     return dx, kernels("sf_depth").substitute(system.E, C, system.w, dx)
 
@@ -279,8 +280,8 @@ def with_covariance(seen: Observations, found: Optimum, poses: bool, intrinsics:
             gauge[6 * j : 6 * j + 3] = T[:3, 3]
         S += np.trace(S) * np.outer(gauge, gauge) / max(gauge @ gauge, 1e-300)
     scores = system.scores - scaled * system.w  # of poses, stretches and intrinsics alone, [P, N]
-    inverse = np.linalg.pinv(S, hermitian=True) if len(S) else S
-    covariance = inverse @ _spread(seen.uv, scores, left, sigma**2 * S) @ inverse
+    inverse = _inverse(S)
+    covariance = inverse @ _spread(seen.uv, scores, left) @ inverse + sigma**2 * inverse
     if at.stretch is not None:
         shift = _without(S, _stretches(len(at.T), poses), at.stretch.ravel())
         covariance += np.outer(shift, shift)
@@ -297,18 +298,23 @@ def _without(S: Float64, where: np.ndarray, values: Float64) -> Float64:
     all over an image draw them, of which a stretch is one sort only."""
     others = np.delete(np.arange(len(S)), where)
     shift = np.zeros(len(S))
-    shift[others] = np.linalg.solve(S[np.ix_(others, others)], S[np.ix_(others, where)] @ values)
+    shift[others] = _inverse(S[np.ix_(others, others)]) @ (S[np.ix_(others, where)] @ values)
     return shift
 
 
-def _spread(uv: Float64, scores: Float64, left: Float64, independent: Float64) -> Float64:
-    """Covariance [P, P] of the sum of the scores [P, N] of pixels [2, N], never less than the ``independent`` one.
+def _inverse(S: Float64) -> Float64:
+    """Inverse of an information [P, P]; what nothing tells, as the pose of a lost source, is unsure without end."""
+    values, vectors = np.linalg.eigh(S)
+    return np.asarray((vectors / np.maximum(values, _LEAST_TOLD * values.max(initial=1e-300))) @ vectors.T)
 
-    ``left`` [P] is what the gradient leaves: not 0 for what is not free, which counts as unsure as far as it goes.
+
+def _spread(uv: Float64, scores: Float64, left: Float64) -> Float64:
+    """Covariance [P, P] of the sum of the scores [P, N] of pixels [2, N], beyond that of independent ones.
 
     The errors of neighbouring correspondences are alike, and what the camera model leaves out (a rolling shutter,
     a lens) is so all over the image; as independent ones they would seem to average out. Tiles of the image take
-    the place of observations instead, as in the cluster-robust estimate of Liang and Zeger.
+    the place of observations instead, as in the cluster-robust estimate of Liang and Zeger. ``left`` [P] is what the
+    gradient leaves: not 0 for what is not free, which counts as unsure as far as it goes.
     """
     P = len(scores)
     low, high = uv.min(axis=1, keepdims=True), uv.max(axis=1, keepdims=True)
@@ -320,7 +326,7 @@ def _spread(uv: Float64, scores: Float64, left: Float64, independent: Float64) -
     sums = np.stack([np.bincount(tile, score, rows * cols) for score in scores]) if P else np.zeros((0, 1))
     count = int((np.bincount(tile) > 0).sum())
     clustered = sums @ sums.T * (count / max(count - P, 1))
-    return np.asarray(clustered + independent + np.outer(left, left))
+    return np.asarray(clustered + np.outer(left, left))
 
 
 def rescaled(adjusted: Adjusted, factor: float) -> Adjusted:

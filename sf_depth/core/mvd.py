@@ -10,12 +10,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sf_depth.config import DepthConfig
-from sf_depth.core import checks, dense_ba, dense_depth, pinhole
+from sf_depth.core import checks, dense_ba, dense_depth, focal, pinhole
 from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
 from sf_depth.core.expectation import expected
 from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
@@ -52,6 +52,7 @@ class Recovered:
         sigma: deviation of a correspondence, px.
         distortion: radial term k1 of the images, 0 unless they show one.
         contradicted: given poses fit the images so badly that they were refined and only give the scale.
+        usual: the views hardly tell the focal length, which was drawn to that of usual cameras.
     """
 
     depth: DepthMap
@@ -62,6 +63,7 @@ class Recovered:
     sigma: float
     distortion: float
     contradicted: bool = False
+    usual: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +81,13 @@ class _Matched:
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """The optimum of dense BA, the observations that passed the checks, and how sure its scale is (relative)."""
+    """The optimum of dense BA, the observations that passed the checks, and how sure scale and focal length are."""
 
     adjusted: Adjusted
     seen: Observations
-    scale_deviation: float = 0.0
+    scale_deviation: float = 0.0  # relative
     contradicted: bool = False
+    focal_deviation: float = 0.0  # relative, where it was drawn to that of usual cameras
 
 
 class MultiViewDepth:
@@ -143,6 +146,7 @@ class MultiViewDepth:
             fit = self._check_and_adjust(matched.seen, at, size, not kept, free, T is None)
         if T is None:
             fit = self._with_lens(matched.seen, fit, size, free)
+            fit = self._with_usual_focal(matched.seen, fit, size, free)
         if theta is not None and T is not None:
             fit = self._refine_noisy_poses(matched.seen, fit, size) if kept else _scaled(fit, T)
         depth = _dense(matched, fit, size)
@@ -204,6 +208,16 @@ class MultiViewDepth:
             if deviation > _SURE:
                 return fit
         return self._check_and_adjust(seen, found.estimate, size, True, bent, True)
+
+    def _with_usual_focal(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
+        """The fit with the focal length of usual cameras as far as the views do not tell it."""
+        if free == "none" or (deviation := dense_depth.focal_deviation(fit.adjusted)) < focal.UNSURE:
+            return fit
+        at = fit.adjusted.estimate
+        f, deviation = focal.drawn(at.theta[0], deviation, max(size.width, size.height))
+        theta = at.theta * [f / at.theta[0], f / at.theta[0], 1, 1, 1]
+        fit = self._check_and_adjust(seen, replace(at, theta=theta), size, True, "none", True)
+        return replace(fit, focal_deviation=deviation)
 
     def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
         """The fit with poses as given; None if they contradict the correspondences, or explain few of them."""
@@ -317,7 +331,7 @@ def _recovered(
         )
     variance = np.where(np.isfinite(z), z**4 * solved.variance + (z * fit.scale_deviation) ** 2, np.nan)
     own = camera or pinhole.camera_of(at.theta, size.width, size.height)
-    focal_sigma = 0.0 if camera is not None else dense_depth.focal_deviation(adjusted)
+    focal_sigma = 0.0 if camera is not None else fit.focal_deviation or dense_depth.focal_deviation(adjusted)
     return Recovered(
         DepthMap(z, variance, scale),
         own,
@@ -327,4 +341,5 @@ def _recovered(
         adjusted.sigma,
         float(at.theta[4]),
         fit.contradicted,
+        fit.focal_deviation > 0,
     )
