@@ -167,7 +167,7 @@ def flow(first: UInt8, second: UInt8, fine: bool = False) -> Float32:
         search.setPatchSize(6)
         search.setPatchStride(4)
         search.setGradientDescentIterations(8)
-        search.setVariationalRefinementIterations(1)
+        search.setVariationalRefinementIterations(0)
     return np.asarray(search.calc(first, second, None), dtype=np.float32)
 
 

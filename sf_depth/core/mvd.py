@@ -169,7 +169,7 @@ class MultiViewDepth:
         Raises:
             InsufficientParallax: next to nothing passes.
         """
-        for _ in range(_CHECK_ROUNDS):
+        for last in (False,) * (_CHECK_ROUNDS - 1) + (True,):
             weight = checks.checked(seen.weight, seen.uv, seen.target, at, size.width)
             if (weight > 0).any(axis=0).sum() < _REGISTERED:
                 raise InsufficientParallax(
@@ -177,7 +177,7 @@ class MultiViewDepth:
                     "scene; give views that are a tenth of the distance to the scene apart"
                 )
             good = Observations(seen.uv, seen.target, weight)
-            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, stretch=stretch)
+            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, stretch=stretch and last)
             at = found.estimate
         return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
 
