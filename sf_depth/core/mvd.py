@@ -76,7 +76,14 @@ class _Fit:
     seen: Observations
     scale_deviation: float = 0.0  # relative
     contradicted: bool = False
-    focal_deviation: float = 0.0  # relative, where it was drawn to that of usual cameras
+    focal_deviation: float | None = None  # relative; None: what the covariance says
+    usual: bool = False  # the focal length was drawn to that of usual cameras
+
+    @property
+    def unsure(self) -> float:
+        """Relative deviation of a free focal length."""
+        told = self.focal_deviation
+        return dense_depth.focal_deviation(self.adjusted) if told is None else told
 
 
 class MultiViewDepth:
@@ -184,7 +191,8 @@ class MultiViewDepth:
     def _with_lens(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
         """The fit with a radial term where the images show a lens, otherwise as it was.
 
-        Beside an unknown focal length only where the views tell both.
+        Beside an unknown focal length only where the views tell both; as the two make up for each other, what the
+        lens moves the focal length by counts as unsure in it.
         """
         bent = _BENT.get(free) if self._lens else None
         if bent is None:
@@ -199,17 +207,19 @@ class MultiViewDepth:
             if deviation > _SURE:
                 return fit
         at = replace(found.estimate, inverse_depth=fit.adjusted.estimate.inverse_depth)
-        return self._check_and_adjust(seen, at, size, True, bent, True)
+        lens = self._check_and_adjust(seen, at, size, True, bent, True)
+        moved = np.log(lens.adjusted.estimate.theta[0] / fit.adjusted.estimate.theta[0])
+        return replace(lens, focal_deviation=float(np.hypot(lens.unsure, moved)))
 
     def _with_usual_focal(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
         """The fit with the focal length of usual cameras as far as the views do not tell it."""
-        if free == "none" or (deviation := dense_depth.focal_deviation(fit.adjusted)) < focal.UNSURE:
+        if free == "none" or fit.unsure < focal.UNSURE:
             return fit
         at = fit.adjusted.estimate
-        f, deviation = focal.drawn(at.theta[0], deviation, max(size.width, size.height))
+        f, deviation = focal.drawn(at.theta[0], fit.unsure, max(size.width, size.height))
         theta = at.theta * [f / at.theta[0], f / at.theta[0], 1, 1, 1]
         fit = self._check_and_adjust(seen, replace(at, theta=theta), size, True, "none", True)
-        return replace(fit, focal_deviation=deviation)
+        return replace(fit, focal_deviation=deviation, usual=True)
 
     def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
         """The fit with poses as given; None if they contradict the correspondences, or explain few of them."""
@@ -309,7 +319,7 @@ def _recovered(
         )
     variance = np.where(np.isfinite(z), z**4 * solved.variance + (z * fit.scale_deviation) ** 2, np.nan)
     own = camera or pinhole.camera_of(at.theta, size.width, size.height)
-    focal_sigma = 0.0 if camera is not None else fit.focal_deviation or dense_depth.focal_deviation(adjusted)
+    focal_sigma = 0.0 if camera is not None else fit.unsure
     return Recovered(
         DepthMap(z, variance, scale),
         own,
@@ -319,5 +329,5 @@ def _recovered(
         adjusted.sigma,
         float(at.theta[4]),
         fit.contradicted,
-        fit.focal_deviation > 0,
+        fit.usual,
     )
