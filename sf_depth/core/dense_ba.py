@@ -5,6 +5,11 @@
 Levenberg-Marquardt with a Cauchy kernel. The inverse depths are eliminated by the Schur complement: with
 ``C dd + E^T dx = w`` the depth step is ``dd = C^-1 (w - E^T dx)``, where x holds poses and intrinsics alike.
 The sums over all correspondences are compiled; ``dense_ba_reference`` says what they are.
+
+The errors of correspondences are not independent: what a source gets wrong it gets wrong all over its image, and free
+poses would explain that by a motion. Each source may therefore be drawn by a small symmetric stretch ``(1 + s, t; t,
+1 - s)`` of its image, which no motion and no zoom makes, with a prior that keeps it small. It is a part of the errors,
+marginalised like the inverse depths, and belongs to no result.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -24,6 +29,8 @@ KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
 _LEAST_SIGMA = 0.02  # px; correspondences are never better than this
 _FALL = 1e-4  # relative fall of the cost below which the iteration has converged
 _TILES = (9, 12)  # rows and columns of the tiles that count as independent in the covariance
+_STRETCH = 0.02  # what the prior of a stretch weighs: so much of the px^2 by which it moves a pixel at tangent 1
+_LEAST_TOLD = 1e-9  # of the surest combination of parameters; sums in single precision tell no less
 _LARGEST_STEP = 4.0  # factor by which one step may change an inverse depth
 
 
@@ -50,11 +57,18 @@ class Estimate:
         theta: intrinsics [5], see :mod:`sf_depth.core.pinhole`.
         T: T_source_reference [S, 4, 4].
         inverse_depth: [N], 1 / unit of the translations, positive.
+        stretch: (s, t) of every source [S, 2]; None: none is drawn.
     """
 
     theta: Float64
     T: Float64
     inverse_depth: Float64
+    stretch: Float64 | None = None
+
+    @property
+    def drawn(self) -> Float64:
+        """The stretches of all sources [S, 2]."""
+        return np.zeros((len(self.T), 2)) if self.stretch is None else self.stretch
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +106,7 @@ class Adjusted(Optimum):
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Normal equations: H [P, P] and g [P] of poses and intrinsics, C [N] and w [N] of depths, E [P, N] between.
+    """Normal equations: H [P, P] and g [P] of poses, stretches, intrinsics; C [N] and w [N] of depths; E [P, N] both.
 
     ``scores`` is what each pixel contributes to g, [P, N], where it was asked for.
     """
@@ -106,28 +120,41 @@ class System:
 
 
 def adjust(
-    seen: Observations, start: Estimate, *, poses: bool = True, intrinsics: str = "none", iterations: int = 25
+    seen: Observations,
+    start: Estimate,
+    *,
+    poses: bool = True,
+    intrinsics: str = "none",
+    stretch: bool = False,
+    iterations: int = 25,
 ) -> Adjusted:
     """:func:`optimum` with its covariance."""
-    found = optimum(seen, start, poses=poses, intrinsics=intrinsics, iterations=iterations)
+    found = optimum(seen, start, poses=poses, intrinsics=intrinsics, stretch=stretch, iterations=iterations)
     return with_covariance(seen, found, poses, intrinsics)
 
 
 def optimum(
-    seen: Observations, start: Estimate, *, poses: bool = True, intrinsics: str = "none", iterations: int = 25
+    seen: Observations,
+    start: Estimate,
+    *,
+    poses: bool = True,
+    intrinsics: str = "none",
+    stretch: bool = False,
+    iterations: int = 25,
 ) -> Optimum:
     """Minimise the reprojection error over the inverse depths and whatever is free.
 
     Args:
         poses: whether the poses of the sources are free; fixed ones also fix the scale.
         intrinsics: which are free: none, f, pinhole (fx fy cx cy), radial (f and one radial term).
+        stretch: whether the images of the sources may be drawn; only with free poses.
         iterations: at most.
     """
-    here, damping, done = start, 1e-3, 0
+    here, damping, done = replace(start, stretch=start.drawn if stretch and poses else None), 1e-3, 0
     squares = squared_residuals(seen, here)
     while done < iterations:
         sigma = _deviation(squares)
-        cost = robust_cost(squares, seen.weight, sigma)
+        cost = _cost(squares, seen, here, sigma)
         columns = pinhole.free_columns(here.theta, intrinsics)
         system = linearise(seen, here, sigma, poses, columns)
         better = None
@@ -135,7 +162,7 @@ def optimum(
             done += 1
             there = moved(here, step(system, damping), poses, columns)
             squares_there = squared_residuals(seen, there)
-            new = robust_cost(squares_there, seen.weight, sigma)
+            new = _cost(squares_there, seen, there, sigma)
             if new < cost:
                 better, fall = there, (cost - new) / cost
                 damping = max(damping / 10, 1e-9)
@@ -149,12 +176,12 @@ def optimum(
         if fall < _FALL:
             break
     sigma = _deviation(squares)
-    return Optimum(here, done, sigma, robust_cost(squares, seen.weight, sigma))
+    return Optimum(here, done, sigma, _cost(squares, seen, here, sigma))
 
 
 def _arrays(seen: Observations, at: Estimate) -> tuple[Float64, ...]:
-    """What the kernels take: theta, T, rays, inverse depth, target, weight."""
-    arrays = (at.theta, at.T, pinhole.rays(at.theta, seen.uv), at.inverse_depth, seen.target, seen.weight)
+    """What the kernels take: theta, T, rays, inverse depth, target, weight, stretch."""
+    arrays = (at.theta, at.T, pinhole.rays(at.theta, seen.uv), at.inverse_depth, seen.target, seen.weight, at.drawn)
     return tuple(np.ascontiguousarray(array, np.float64) for array in arrays)
 
 
@@ -175,21 +202,50 @@ def robust_cost(squares: Float32, weight: Float64, sigma: float) -> float:
     return float(total / max(weights, 1e-12))
 
 
+def stretch_information(seen: Observations, at: Estimate) -> Float64:
+    """Of the prior of each source's stretch, [S]: in proportion to its correspondences, whose errors are alike."""
+    return np.asarray(_STRETCH * at.theta[0] ** 2 * seen.weight.sum(axis=1))
+
+
+def _cost(squares: Float32, seen: Observations, at: Estimate, sigma: float) -> float:
+    """:func:`robust_cost` with that of the stretches."""
+    cost = robust_cost(squares, seen.weight, sigma)
+    if at.stretch is None:
+        return cost
+    drawn = stretch_information(seen, at) @ (at.stretch**2).sum(axis=1)
+    return float(cost + drawn / max(seen.weight.sum(), 1e-12))
+
+
 def linearise(
     seen: Observations, at: Estimate, sigma: float, poses: bool, columns: Float64, scores: bool = False
 ) -> System:
-    """Normal equations at an estimate with the Cauchy weights of a deviation ``sigma`` px."""
+    """Normal equations at an estimate with the Cauchy weights of a deviation ``sigma`` px.
+
+    The stretches of the sources are free where the estimate has some.
+    """
     x = pinhole.rays(at.theta, seen.uv).astype(np.float32)
     dx = pinhole.rays_jacobian(at.theta, x, columns) if columns.shape[1] else np.zeros((2, 0, 0), np.float32)
     arrays = (*_arrays(seen, at), np.ascontiguousarray(dx), np.ascontiguousarray(columns))
-    return System(*kernels("sf_depth").linearise(*arrays, poses, (KERNEL * sigma) ** 2, scores))
+    drawn = at.stretch is not None
+    system = System(*kernels("sf_depth").linearise(*arrays, poses, drawn, (KERNEL * sigma) ** 2, scores))
+    if at.stretch is not None:
+        where = _stretches(len(at.T), poses)
+        information = np.repeat(stretch_information(seen, at), 2)
+        system.H[where, where] += information
+        system.g[where] -= information * at.stretch.ravel()
+    return system
+
+
+def _stretches(count: int, poses: bool) -> np.ndarray:
+    """Rows of the stretches of so many sources among all: behind their poses."""
+    return (6 * count if poses else 0) + np.arange(2 * count)
 
 
 def step(system: System, damping: float) -> tuple[Float64, Float64]:
     """Damped step (dx [P], dd [N]); damping is relative to each diagonal, so it scales with the residuals."""
     C = system.C * np.float32(1.0 + damping) + least_information(system.C)
     S, b = kernels("sf_depth").eliminate(system.E, C, system.w, system.H, system.g)
-    S[np.diag_indices_from(S)] += damping * np.diag(system.H) + 1e-12 * np.trace(system.H)
+    S[np.diag_indices_from(S)] += damping * np.diag(system.H) + 1e-12 * np.trace(system.H) + 1e-300
     dx = np.linalg.solve(S, b) if len(S) else np.zeros(0)
     return dx, kernels("sf_depth").substitute(system.E, C, system.w, dx)
 
@@ -204,9 +260,10 @@ def moved(at: Estimate, step: tuple[Float64, Float64], poses: bool, columns: Flo
     dx, dd = step
     count = len(at.T)
     T = se3.exp(dx[: 6 * count].reshape(count, 6)) @ at.T if poses else at.T
+    drawn = None if at.stretch is None else at.stretch + dx[_stretches(count, poses)].reshape(count, 2)
     theta = pinhole.moved(at.theta, columns, dx[len(dx) - columns.shape[1] :]) if columns.shape[1] else at.theta
     d = np.clip(at.inverse_depth + dd, at.inverse_depth / _LARGEST_STEP, at.inverse_depth * _LARGEST_STEP)
-    return Estimate(theta, T, d)
+    return Estimate(theta, T, d, drawn)
 
 
 def with_covariance(seen: Observations, found: Optimum, poses: bool, intrinsics: str) -> Adjusted:
@@ -216,27 +273,48 @@ def with_covariance(seen: Observations, found: Optimum, poses: bool, intrinsics:
     system = linearise(seen, at, sigma, poses, columns, scores=True)
     C = system.C + least_information(system.C)
     scaled = system.E / C
-    S, _ = kernels("sf_depth").eliminate(system.E, C, system.w, system.H, system.g)
+    S, left = kernels("sf_depth").eliminate(system.E, C, system.w, system.H, system.g)
     if poses and len(S):
         gauge = np.zeros(len(S))
         for j, T in enumerate(at.T):
             gauge[6 * j : 6 * j + 3] = T[:3, 3]
         S += np.trace(S) * np.outer(gauge, gauge) / max(gauge @ gauge, 1e-300)
-    scores = system.scores - scaled * system.w  # of poses and intrinsics alone, [P, N]
-    inverse = np.linalg.pinv(S, hermitian=True) if len(S) else S
-    covariance = inverse @ _spread(seen.uv, scores, sigma**2 * S) @ inverse
+    scores = system.scores - scaled * system.w  # of poses, stretches and intrinsics alone, [P, N]
+    inverse = _inverse(S)
+    covariance = inverse @ _spread(seen.uv, scores, left) @ inverse + sigma**2 * inverse
+    if at.stretch is not None:
+        shift = _without(S, _stretches(len(at.T), poses), at.stretch.ravel())
+        covariance += np.outer(shift, shift)
     common = (scaled * (covariance.astype(np.float32) @ scaled)).sum(axis=0)
+    kept = np.delete(np.arange(len(S)), _stretches(len(at.T), poses) if at.stretch is not None else [])
+    covariance = covariance[np.ix_(kept, kept)]
     with np.errstate(divide="ignore"):
         variance = sigma**2 / system.C + common
     return Adjusted(at, found.iterations, sigma, found.cost, covariance, variance, common)
 
 
-def _spread(uv: Float64, scores: Float64, independent: Float64) -> Float64:
-    """Covariance [P, P] of the sum of the scores [P, N] of pixels [2, N], never less than the ``independent`` one.
+def _without(S: Float64, where: np.ndarray, values: Float64) -> Float64:
+    """What all others [P] would move by if those at ``where`` did not have their values: how far errors that are alike
+    all over an image draw them, of which a stretch is one sort only."""
+    others = np.delete(np.arange(len(S)), where)
+    shift = np.zeros(len(S))
+    shift[others] = _inverse(S[np.ix_(others, others)]) @ (S[np.ix_(others, where)] @ values)
+    return shift
+
+
+def _inverse(S: Float64) -> Float64:
+    """Inverse of an information [P, P]; what nothing tells, as the pose of a lost source, is unsure without end."""
+    values, vectors = np.linalg.eigh(S)
+    return np.asarray((vectors / np.maximum(values, _LEAST_TOLD * values.max(initial=1e-300))) @ vectors.T)
+
+
+def _spread(uv: Float64, scores: Float64, left: Float64) -> Float64:
+    """Covariance [P, P] of the sum of the scores [P, N] of pixels [2, N], beyond that of independent ones.
 
     The errors of neighbouring correspondences are alike, and what the camera model leaves out (a rolling shutter,
     a lens) is so all over the image; as independent ones they would seem to average out. Tiles of the image take
-    the place of observations instead, as in the cluster-robust estimate of Liang and Zeger.
+    the place of observations instead, as in the cluster-robust estimate of Liang and Zeger. ``left`` [P] is what the
+    gradient leaves: not 0 for what is not free, which counts as unsure as far as it goes.
     """
     P = len(scores)
     low, high = uv.min(axis=1, keepdims=True), uv.max(axis=1, keepdims=True)
@@ -248,8 +326,7 @@ def _spread(uv: Float64, scores: Float64, independent: Float64) -> Float64:
     sums = np.stack([np.bincount(tile, score, rows * cols) for score in scores]) if P else np.zeros((0, 1))
     count = int((np.bincount(tile) > 0).sum())
     clustered = sums @ sums.T * (count / max(count - P, 1))
-    total = scores.sum(axis=1)
-    return np.asarray(clustered + independent + np.outer(total, total))
+    return np.asarray(clustered + np.outer(left, left))
 
 
 def rescaled(adjusted: Adjusted, factor: float) -> Adjusted:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from sf_depth.core import pinhole
-from sf_depth.core.dense_ba import KERNEL, MIN_Z, Estimate, Observations, System, least_information
+from sf_depth.core.dense_ba import KERNEL, MIN_Z, Estimate, Observations, System, least_information, stretch_information
 from sf_interfaces.types import Float64
 
 _SINGLE = np.float32  # of the normal equations; residuals and the estimate are in double precision
@@ -19,8 +19,15 @@ def residuals(seen: Observations, at: Estimate) -> Float64:
     for j, T in enumerate(at.T):
         X = transformed(T, x, at.inverse_depth)
         X[2][X[2] < MIN_Z] = np.nan
-        out[j] = seen.target[j] - pinhole.project(at.theta, X[:2] / X[2])
+        out[j] = seen.target[j] - drawn(at, j, pinhole.project(at.theta, X[:2] / X[2]))
     return out
+
+
+def drawn(at: Estimate, j: int, uv: Float64) -> Float64:
+    """Pixels [2, N] of source j where its stretch draws them."""
+    s, t = at.drawn[j]
+    M = np.array([[1 + s, t], [t, 1 - s]])
+    return at.theta[2:4, None] + at.theta[:2, None] * (M @ ((uv - at.theta[2:4, None]) / at.theta[:2, None]))
 
 
 def transformed(T: Float64, x: Float64, d: Float64) -> Float64:
@@ -51,55 +58,64 @@ def cost(r: Float64, weight: Float64, sigma: float) -> float:
 def linearise(seen: Observations, at: Estimate, weight: Float64, r: Float64, poses: bool, columns: Float64) -> System:
     """Normal equations at an estimate, weights [S, N] and residuals [S, 2, N] given; in single precision."""
     count, K = len(at.T), columns.shape[1]
-    own = 6 * count if poses else 0
+    pose, stretch = 6 if poses else 0, 2 if at.stretch is not None else 0
+    own = (pose + stretch) * count
     P, N = own + K, seen.uv.shape[1]
     H, scores, E = np.zeros((P, P)), np.zeros((P, N), _SINGLE), np.zeros((P, N), _SINGLE)
     C, w = np.zeros(N, _SINGLE), np.zeros(N, _SINGLE)
     x, d = pinhole.rays(at.theta, seen.uv).astype(_SINGLE), at.inverse_depth.astype(_SINGLE)
     dx = pinhole.rays_jacobian(at.theta, x, columns) if K else np.zeros((2, 0, N), _SINGLE)
-    for j, T in enumerate(at.T):
-        A, a = jacobians(at.theta, T, x, dx, d, poses, columns)
+    for j in range(count):
+        A, a = jacobians(at, j, x, dx, d, poses, columns)
         root = np.sqrt(weight[j]).astype(_SINGLE)
         A *= root  # 0 where the source is blind, and what was clipped there is finite
         a *= root
         b = np.where(root > 0, r[j], 0.0).astype(_SINGLE) * root
         flat = A.reshape(len(A), 2 * N)
-        rows = np.r_[6 * j : 6 * j + 6, own:P] if poses else np.arange(own, P)
+        first = pose * count + stretch * j
+        rows = np.r_[pose * j : pose * (j + 1), first : first + stretch, own:P]
         H[np.ix_(rows, rows)] += flat @ flat.T
-        pose, count = slice(6 * j, 6 * j + 6), len(A) - K
-        for total, (first, second) in ((scores, b), (E, a)):
-            part = A[:, 0] * first + A[:, 1] * second
-            total[pose][:count] = part[:count]  # of this source alone
-            total[own:] += part[count:]
+        scores[rows] += A[:, 0] * b[0] + A[:, 1] * b[1]
+        E[rows] += A[:, 0] * a[0] + A[:, 1] * a[1]
         C += a[0] ** 2 + a[1] ** 2
         w += a[0] * b[0] + a[1] * b[1]
-    return System(H, scores.sum(axis=1, dtype=np.float64), E, C, w, scores)
+    g = scores.sum(axis=1, dtype=np.float64)
+    if at.stretch is not None:
+        where, information = pose * count + np.arange(2 * count), np.repeat(stretch_information(seen, at), 2)
+        H[where, where] += information
+        g[where] -= information * at.stretch.ravel()
+    return System(H, g, E, C, w, scores)
 
 
 def jacobians(
-    theta: Float64, T: Float64, x: Float64, dx: Float64, d: Float64, poses: bool, columns: Float64
+    at: Estimate, j: int, x: Float64, dx: Float64, d: Float64, poses: bool, columns: Float64
 ) -> tuple[Float64, Float64]:
-    """d Pi / d (pose, phi) [6 + K, 2, N] and d Pi / d d [2, N] of one source, in the precision of ``x``."""
-    theta, T, columns = (array.astype(x.dtype, copy=False) for array in (theta, T, columns))
+    """d Pi / d (pose, stretch, phi) [6 + 2 + K, 2, N] and d Pi / d d [2, N] of source j, in the precision of ``x``."""
+    s, t = at.drawn[j].astype(x.dtype)
+    theta, T, columns = (array.astype(x.dtype, copy=False) for array in (at.theta, at.T[j], columns))
     X = transformed(T, x, d)
     inverse_z = 1.0 / np.maximum(X[2], MIN_Z)
     y = X[:2] * inverse_z
     uu, uv, vv = pinhole.project_jacobian(theta, y)
+    fx, fy = theta[:2]
+    M = np.array([[1 + s, t * fx / fy], [t * fy / fx, 1 - s]], x.dtype)
     J = np.empty((3, 2, len(d)), x.dtype)  # d uv / d (point in the source)
-    J[0] = theta[0] * inverse_z * uu, theta[1] * inverse_z * uv
-    J[1] = theta[0] * inverse_z * uv, theta[1] * inverse_z * vv
+    J[0] = M @ np.stack([fx * inverse_z * uu, fy * inverse_z * uv])
+    J[1] = M @ np.stack([fx * inverse_z * uv, fy * inverse_z * vv])
     J[2] = -(y[0] * J[0] + y[1] * J[1])
-    A = np.empty(((6 if poses else 0) + columns.shape[1], 2, len(d)), x.dtype)
+    parts = []
     if poses:
-        A[:3] = J * d  # translations act on the point of unit ray in proportion to its inverse depth
-        A[3] = X[1] * J[2] - X[2] * J[1]
-        A[4] = X[2] * J[0] - X[0] * J[2]
-        A[5] = X[0] * J[1] - X[1] * J[0]
+        # translations act on the point of unit ray in proportion to its inverse depth
+        turned = [X[1] * J[2] - X[2] * J[1], X[2] * J[0] - X[0] * J[2], X[0] * J[1] - X[1] * J[0]]
+        parts += [J * d, np.stack(turned)]
+    if at.stretch is not None:
+        u, v = theta[:2, None] * y * (1 + theta[4] * (y * y).sum(axis=0))
+        parts.append(np.stack([[u, -v], [v * fx / fy, u * fy / fx]]))
     if columns.shape[1]:
-        own = pinhole.project_parameters(theta, y, columns)
-        for k in range(columns.shape[1]):
-            v = T[:3, :2] @ dx[:, k]
-            A[k - columns.shape[1]] = v[0] * J[0] + v[1] * J[1] + v[2] * J[2] + own[:, k]
+        own = pinhole.project_parameters(theta, y, columns, np.array([[1 + s, t], [t, 1 - s]], x.dtype))
+        moved = np.einsum("ij,jkn->kin", T[:3, :2], dx)
+        parts.append(np.einsum("kin,icn->kcn", moved, J) + own.transpose(1, 0, 2))
+    A = np.concatenate(parts) if parts else np.empty((0, 2, len(d)), x.dtype)
     t = T[:3, 3]
     return A, t[0] * J[0] + t[1] * J[1] + t[2] * J[2]
 

@@ -10,14 +10,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sf_depth.config import DepthConfig
-from sf_depth.core import checks, dense_ba, dense_depth, pinhole
+from sf_depth.core import checks, dense_ba, dense_depth, focal, pinhole
 from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
 from sf_depth.core.expectation import expected
+from sf_depth.core.matched import Matched, matched, thinned
 from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
 from sf_depth.core.outliers import lonely
 from sf_depth.core.parallel import each, one_blas_thread
@@ -33,6 +34,7 @@ _LEAST_KEPT = 0.3  # share of the correspondences that given poses have to expla
 _BENT = {"none": "lens", "f": "radial"}  # what is free with a radial term
 _LENS = 0.01  # share of the cost that a radial term has to explain; 0.003 is the most where there is no lens
 _SURE = 0.01  # deviation of an unknown focal length; less sure, it and the radial term make up for each other
+_LENS_THINNING = 3  # every n-th of the pixels of dense BA tells whether there is a lens
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
 _BLOCK = 1 << 15  # pixels solved at once: their arrays stay in the cache
 CONTRADICTED = "given poses contradict the images: refined, they only give the scale, and the variance tells how well"
@@ -52,6 +54,7 @@ class Recovered:
         sigma: deviation of a correspondence, px.
         distortion: radial term k1 of the images, 0 unless they show one.
         contradicted: given poses fit the images so badly that they were refined and only give the scale.
+        usual: the views hardly tell the focal length, which was drawn to that of usual cameras.
     """
 
     depth: DepthMap
@@ -62,29 +65,25 @@ class Recovered:
     sigma: float
     distortion: float
     contradicted: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class _Matched:
-    """Cross-checked correspondences: target [S, H, W, 2] px and weight [S, H, W]; ``seen`` is every n-th of them.
-
-    A coarse match has half the rows and columns; its pixels are those of the full images.
-    """
-
-    target: Float32
-    weight: Float32
-    seen: Observations
-    grid: tuple[int, int]  # rows and columns of ``seen``
+    usual: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """The optimum of dense BA, the observations that passed the checks, and how sure its scale is (relative)."""
+    """The optimum of dense BA, the observations that passed the checks, and how sure scale and focal length are."""
 
     adjusted: Adjusted
     seen: Observations
-    scale_deviation: float = 0.0
+    scale_deviation: float = 0.0  # relative
     contradicted: bool = False
+    focal_deviation: float | None = None  # relative; None: what the covariance says
+    usual: bool = False  # the focal length was drawn to that of usual cameras
+
+    @property
+    def unsure(self) -> float:
+        """Relative deviation of a free focal length."""
+        told = self.focal_deviation
+        return dense_depth.focal_deviation(self.adjusted) if told is None else told
 
 
 class MultiViewDepth:
@@ -131,21 +130,22 @@ class MultiViewDepth:
         theta = None if camera is None else pinhole.theta_of(camera)
         free = self._config.intrinsics if camera is None else "none"
 
-        matched = self._match(reference, sources, coarse=self._config.rematches > 0)
-        fit = None if theta is None or T is None else self._with_given_poses(matched.seen, theta, T, size)
+        pairs = self._match(reference, sources, coarse=self._config.rematches > 0)
+        fit = None if theta is None or T is None else self._with_given_poses(pairs.seen, theta, T, size)
         kept = fit is not None  # whether the given poses are taken as they are
-        fit = fit or self._check_and_adjust(matched.seen, start(matched.seen, size, theta), size, True, free)
+        fit = fit or self._check_and_adjust(pairs.seen, start(pairs.seen, size, theta), size, True, free)
         for _ in range(self._config.rematches):
-            guess = expected(reference, sources, fit.adjusted, fit.seen, matched.grid, _REGISTERED)
-            matched = self._match(reference, sources, guess)
+            guess = expected(reference, sources, fit.adjusted, fit.seen, pairs.grid, _REGISTERED)
+            pairs = self._match(reference, sources, guess)
             at = fit.adjusted.estimate
-            at = _triangulated(matched.seen, at.theta, at.T)
-            fit = self._check_and_adjust(matched.seen, at, size, not kept, free)
+            at = _triangulated(pairs.seen, at.theta, at.T)
+            fit = self._check_and_adjust(pairs.seen, at, size, not kept, free, T is None)
         if T is None:
-            fit = self._with_lens(matched.seen, fit, size, free)
+            fit = self._with_lens(pairs.seen, fit, size, free)
+            fit = self._with_usual_focal(pairs.seen, fit, size, free)
         if theta is not None and T is not None:
-            fit = self._refine_noisy_poses(matched.seen, fit, size) if kept else _scaled(fit, T)
-        depth = _dense(matched, fit, size)
+            fit = self._refine_noisy_poses(pairs.seen, fit, size) if kept else _scaled(fit, T)
+        depth = _dense(pairs, fit, size)
         return _recovered(depth, fit, size, camera, Scale.ARBITRARY if T is None else Scale.METRIC)
 
     def _match(
@@ -154,27 +154,29 @@ class MultiViewDepth:
         sources: Sequence[UInt8],
         guess: Sequence[Float32 | None] | None = None,
         coarse: bool = False,
-    ) -> _Matched:
+    ) -> Matched:
         """Correspondences to every source that come back to where they started."""
         size = Size(reference.shape[1], reference.shape[0])
 
-        def one(j: int) -> tuple[Float32, Float32]:
+        def one(j: int) -> tuple[Float32, Float32, np.ndarray]:
             expected = None if guess is None else guess[j]
             found = self._matcher(reference, sources[j], expected, coarse=coarse)
-            weight = checks.cross_check(found, size)
-            return np.where(weight[..., None] > 0, found.target, np.float32(0)), weight
+            weight, exact = checks.cross_check(found, size)
+            return np.where(weight[..., None] > 0, found.target, np.float32(0)), weight, exact
 
         found = each(one, range(len(sources)))
-        target, weight = (np.stack(part) for part in zip(*found, strict=True))
-        return _Matched(target, weight, *_strided(target, weight, self._config.stride, size))
+        target, weight, exact = (np.stack(part) for part in zip(*found, strict=True))
+        return matched(target, weight, exact, self._config.stride, size)
 
-    def _check_and_adjust(self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str) -> _Fit:
+    def _check_and_adjust(
+        self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str, stretch: bool = False
+    ) -> _Fit:
         """Dense BA over what passes the checks; both run again with the better geometry.
 
         Raises:
             InsufficientParallax: next to nothing passes.
         """
-        for _ in range(_CHECK_ROUNDS):
+        for last in (False,) * (_CHECK_ROUNDS - 1) + (True,):
             weight = checks.checked(seen.weight, seen.uv, seen.target, at, size.width)
             if (weight > 0).any(axis=0).sum() < _REGISTERED:
                 raise InsufficientParallax(
@@ -182,26 +184,42 @@ class MultiViewDepth:
                     "scene; give views that are a tenth of the distance to the scene apart"
                 )
             good = Observations(seen.uv, seen.target, weight)
-            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
+            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, stretch=stretch and last)
             at = found.estimate
         return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
 
     def _with_lens(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
         """The fit with a radial term where the images show a lens, otherwise as it was.
 
-        Beside an unknown focal length only where the views tell both.
+        Beside an unknown focal length only where the views tell both; as the two make up for each other, what the
+        lens moves the focal length by counts as unsure in it.
         """
         bent = _BENT.get(free) if self._lens else None
         if bent is None:
             return fit
-        found = dense_ba.optimum(fit.seen, fit.adjusted.estimate, intrinsics=bent)
-        if found.cost > (1.0 - _LENS) * fit.adjusted.cost:
+        few, at = thinned(fit.seen, fit.adjusted.estimate, _LENS_THINNING)
+        straight = dense_ba.optimum(few, at, intrinsics=free, stretch=True)
+        found = dense_ba.optimum(few, straight.estimate, intrinsics=bent, stretch=True)
+        if found.cost > (1.0 - _LENS) * straight.cost:
             return fit
         if free == "f":
-            deviation = dense_depth.focal_deviation(dense_ba.with_covariance(fit.seen, found, True, bent))
+            deviation = dense_depth.focal_deviation(dense_ba.with_covariance(few, found, True, bent))
             if deviation > _SURE:
                 return fit
-        return self._check_and_adjust(seen, found.estimate, size, True, bent)
+        at = replace(found.estimate, inverse_depth=fit.adjusted.estimate.inverse_depth)
+        lens = self._check_and_adjust(seen, at, size, True, bent, True)
+        moved = np.log(lens.adjusted.estimate.theta[0] / fit.adjusted.estimate.theta[0])
+        return replace(lens, focal_deviation=float(np.hypot(lens.unsure, moved)))
+
+    def _with_usual_focal(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
+        """The fit with the focal length of usual cameras as far as the views do not tell it."""
+        if free == "none" or fit.unsure < focal.UNSURE:
+            return fit
+        at = fit.adjusted.estimate
+        f, deviation = focal.drawn(at.theta[0], fit.unsure, max(size.width, size.height))
+        theta = at.theta * [f / at.theta[0], f / at.theta[0], 1, 1, 1]
+        fit = self._check_and_adjust(seen, replace(at, theta=theta), size, True, "none", True)
+        return replace(fit, focal_deviation=deviation, usual=True)
 
     def _with_given_poses(self, seen: Observations, theta: Float64, T: Float64, size: Size) -> _Fit | None:
         """The fit with poses as given; None if they contradict the correspondences, or explain few of them."""
@@ -257,25 +275,11 @@ def _triangulated(seen: Observations, theta: Float64, T: Float64) -> Estimate:
     return Estimate(theta, T, triangulate(seen, Estimate(theta, T, np.ones(seen.uv.shape[1]))))
 
 
-def _strided(target: Float32, weight: Float32, stride: int, size: Size) -> tuple[Observations, tuple[int, int]]:
-    """Every n-th pixel of both axes as observations, and the size of that grid."""
-    every = (slice(stride // 2, None, stride),) * 2
-    count, height, width = weight.shape
-    uv = pixel_grid((height, width))[every] * np.array([size.width / width, size.height / height], np.float32)
-    columns = target[:, every[0], every[1]].reshape(count, -1, 2).transpose(0, 2, 1).astype(np.float64)
-    seen = Observations(
-        np.ascontiguousarray(uv.reshape(-1, 2).T, dtype=np.float64),
-        np.ascontiguousarray(columns),
-        weight[:, every[0], every[1]].reshape(count, -1).astype(np.float64),
-    )
-    return seen, uv.shape[:2]
-
-
-def _dense(matched: _Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
+def _dense(pairs: Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
     """Inverse depth [H, W] of every pixel whose correspondences pass the checks."""
     at, sigma = fit.adjusted.estimate, fit.adjusted.sigma
     grid = pixel_grid((size.height, size.width)).reshape(-1, 2)
-    weight, target = matched.weight.reshape(len(at.T), -1), matched.target.reshape(len(at.T), -1, 2)
+    weight, target = pairs.weight.reshape(len(at.T), -1), pairs.target.reshape(len(at.T), -1, 2)
 
     def solved(index: np.ndarray) -> dense_depth.InverseDepth:
         uv, to = np.ascontiguousarray(grid[index].T), np.ascontiguousarray(target[:, index].transpose(0, 2, 1))
@@ -288,7 +292,7 @@ def _dense(matched: _Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth
     for name, image in (("d", d), ("variance", variance), ("support", support)):
         image[seen] = np.concatenate([getattr(part, name) for part in parts])
     d, variance, support = (image.reshape(size.height, size.width) for image in (d, variance, support))
-    common = dense_depth.common_variance(fit.adjusted, fit.seen, matched.grid, (size.height, size.width))
+    common = dense_depth.common_variance(fit.adjusted, fit.seen, pairs.grid, (size.height, size.width))
     return dense_depth.InverseDepth(np.where(lonely(d, variance), np.float32(np.nan), d), variance + common, support)
 
 
@@ -315,7 +319,7 @@ def _recovered(
         )
     variance = np.where(np.isfinite(z), z**4 * solved.variance + (z * fit.scale_deviation) ** 2, np.nan)
     own = camera or pinhole.camera_of(at.theta, size.width, size.height)
-    focal_sigma = 0.0 if camera is not None else dense_depth.focal_deviation(adjusted)
+    focal_sigma = 0.0 if camera is not None else fit.unsure
     return Recovered(
         DepthMap(z, variance, scale),
         own,
@@ -325,4 +329,5 @@ def _recovered(
         adjusted.sigma,
         float(at.theta[4]),
         fit.contradicted,
+        fit.usual,
     )

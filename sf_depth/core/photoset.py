@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from sf_depth.config import DepthConfig
-from sf_depth.core import products
+from sf_depth.core import focal, products
 from sf_depth.core.filling import Filler
 from sf_depth.core.matching import grey
 from sf_depth.core.mvd import CONTRADICTED, MultiViewDepth, Recovered, check_images
@@ -216,9 +216,11 @@ class _Work:
         if first and got.distortion:
             self._rectify(got)
             again = self._parts.recover(self._images, reference, sources, got.camera, T)
-            got = replace(again, focal_sigma=got.focal_sigma, distortion=got.distortion)
+            got = replace(again, focal_sigma=got.focal_sigma, distortion=got.distortion, usual=got.usual)
         if got.contradicted:
             self._count(CONTRADICTED)
+        if got.usual:
+            self._count(focal.USUAL)
         scale = GlobalScale(1.0, 0.0)
         if first:
             self._first, self._camera = got, got.camera

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sf_depth.core import dense_ba, pinhole
+from sf_depth.core import dense_ba, focal, pinhole
 from sf_depth.core.dense_ba import Estimate, Observations
 from sf_depth.core.parallel import each
 from sf_interfaces.errors import InsufficientParallax
@@ -65,14 +65,20 @@ def start(seen: Observations, size: Size, theta: Float64 | None) -> Estimate:
         best = _refined(few, _from_essentials(few, size, theta), "none")
     else:
         tried = each(lambda f: _refined(few, _from_essentials(few, size, _centred(size, f)), "none"), _SWEEP)
-        tried.sort(key=lambda found: found.cost)
-        best = min(each(lambda one: _refined(few, one.estimate, "f"), tried[:3]), key=lambda found: found.cost)
+        tried.sort(key=lambda found: _implausibility(found, size))
+        best = min(
+            each(lambda one: _refined(few, one.estimate, "f"), tried[:3]), key=lambda f: _implausibility(f, size)
+        )
     at = _canonical(best.estimate)
     return replace(at, inverse_depth=triangulate(seen, at))
 
 
-def _centred(size: Size, focal: float) -> Float64:
-    f = focal * size.width
+def _implausibility(found: dense_ba.Optimum, size: Size) -> float:
+    return focal.implausibility(found.cost, found.estimate.theta[0], max(size.width, size.height))
+
+
+def _centred(size: Size, widths: float) -> Float64:
+    f = widths * size.width
     return np.array([f, f, size.width / 2, size.height / 2, 0.0])
 
 

@@ -15,17 +15,19 @@ namespace {
 using sf::alone, sf::In, sf::Made, sf::Out, sf::require;
 
 sf::Views views_of(const In<double, 5>& theta, const In<double, -1, 4, 4>& T, const In<double, 2, -1>& x,
-                   const In<double, -1>& d, const In<double, -1, 2, -1>& target, const In<double, -1, -1>& weight) {
+                   const In<double, -1>& d, const In<double, -1, 2, -1>& target, const In<double, -1, -1>& weight,
+                   const In<double, -1, 2>& stretch) {
     const size_t sources = T.shape(0), pixels = x.shape(1);
     require(d.shape(0) == pixels && target.shape(0) == sources && target.shape(2) == pixels &&
-                weight.shape(0) == sources && weight.shape(1) == pixels,
-            "x, d, T, target and weight differ in pixels or sources");
-    return {sources, pixels, theta.data(), T.data(), x.data(), d.data(), target.data(), weight.data()};
+                weight.shape(0) == sources && weight.shape(1) == pixels && stretch.shape(0) == sources,
+            "x, d, T, target, weight and stretch differ in pixels or sources");
+    return {sources, pixels, theta.data(), T.data(), x.data(), d.data(), target.data(), weight.data(),
+            stretch.data()};
 }
 
 Out<float> squared_residuals(In<double, 5> theta, In<double, -1, 4, 4> T, In<double, 2, -1> x, In<double, -1> d,
-                             In<double, -1, 2, -1> target, In<double, -1, -1> weight) {
-    const sf::Views views = views_of(theta, T, x, d, target, weight);
+                             In<double, -1, 2, -1> target, In<double, -1, -1> weight, In<double, -1, 2> stretch) {
+    const sf::Views views = views_of(theta, T, x, d, target, weight, stretch);
     Made<float> squares({views.sources, views.pixels});
     alone([&] { sf::squared_residuals(views, squares.get()); });
     return squares.give();
@@ -39,17 +41,19 @@ nb::tuple robust_cost(In<float, -1, -1> squares, In<double, -1, -1> weight, doub
 }
 
 nb::tuple linearise(In<double, 5> theta, In<double, -1, 4, 4> T, In<double, 2, -1> x, In<double, -1> d,
-                    In<double, -1, 2, -1> target, In<double, -1, -1> weight, In<float, 2, -1, -1> dx,
-                    In<double, 5, -1> columns, bool poses, double c2, bool scores) {
-    const sf::Views views = views_of(theta, T, x, d, target, weight);
+                    In<double, -1, 2, -1> target, In<double, -1, -1> weight, In<double, -1, 2> stretch,
+                    In<float, 2, -1, -1> dx, In<double, 5, -1> columns, bool poses, bool stretches, double c2,
+                    bool scores) {
+    const sf::Views views = views_of(theta, T, x, d, target, weight, stretch);
+    const sf::Free own{poses, stretches};
     const size_t free_ones = columns.shape(1), N = views.pixels;
     require(free_ones <= 4 && dx.shape(1) == free_ones && (free_ones == 0 || dx.shape(2) == N),
             "dx does not fit the columns, at most 4, and x");
-    const size_t P = (poses ? 6 * views.sources : 0) + free_ones;
+    const size_t P = own.columns() * views.sources + free_ones;
     Made<double> H({P, P}), g({P});
     Made<float> E({P, N}), C({N}), w({N}), each({scores ? P : 0, N});
     alone([&] {
-        sf::linearise(views, {free_ones, dx.data(), columns.data()}, poses, c2,
+        sf::linearise(views, {free_ones, dx.data(), columns.data()}, own, c2,
                       {H.get(), g.get(), E.get(), C.get(), w.get(), scores ? each.get() : nullptr});
     });
     return nb::make_tuple(H.give(), g.give(), E.give(), C.give(), w.give(), each.give());
@@ -105,10 +109,11 @@ Out<float> best_paths(In<float, -1, -1, -1> cost, In<float, -1, -1> image, bool 
 NB_MODULE(_native, m) {
     m.doc() = "Compiled kernels of the depth block; the *_reference.py files of its core define them.";
     m.def("squared_residuals", &squared_residuals, nb::arg("theta"), nb::arg("T"), nb::arg("x"), nb::arg("d"),
-          nb::arg("target"), nb::arg("weight"));
+          nb::arg("target"), nb::arg("weight"), nb::arg("stretch"));
     m.def("robust_cost", &robust_cost, nb::arg("squares"), nb::arg("weight"), nb::arg("c2"), nb::arg("blind"));
     m.def("linearise", &linearise, nb::arg("theta"), nb::arg("T"), nb::arg("x"), nb::arg("d"), nb::arg("target"),
-          nb::arg("weight"), nb::arg("dx"), nb::arg("columns"), nb::arg("poses"), nb::arg("c2"), nb::arg("scores"));
+          nb::arg("weight"), nb::arg("stretch"), nb::arg("dx"), nb::arg("columns"), nb::arg("poses"),
+          nb::arg("stretches"), nb::arg("c2"), nb::arg("scores"));
     m.def("eliminate", &eliminate, nb::arg("E"), nb::arg("C"), nb::arg("w"), nb::arg("H"), nb::arg("g"));
     m.def("substitute", &substitute, nb::arg("E"), nb::arg("C"), nb::arg("w"), nb::arg("dx"));
     m.def("dissimilarity", &dissimilarity, nb::arg("first"), nb::arg("mean"), nb::arg("scale"), nb::arg("others"),

@@ -14,7 +14,7 @@ namespace {
 
 constexpr double kMinZ = 0.05;      // of the reference depth
 constexpr size_t kBlock = 512;      // pixels
-constexpr size_t kPose = 6, kFree = 4, kMost = kPose + kFree;  // columns of one source
+constexpr size_t kPose = 6, kStretch = 2, kFree = 4, kMost = kPose + kStretch + kFree;  // columns of one source
 
 // Eight reference pixels in one source.
 struct Seen {
@@ -35,20 +35,44 @@ SF_INLINE Seen see(const Views& p, size_t j, size_t k, size_t count) {
     s.weight = s.blind ? Double8{} : s.weight;
     const Double8 iz = 1.0 / (s.blind ? Double8{} + kMinZ : s.X[2]), a = s.X[0] * iz, b = s.X[1] * iz;
     const Double8 drawn = 1.0 + theta[4] * (a * a + b * b);
-    s.u = load<Double8>(target + k, count) - (theta[0] * a * drawn + theta[2]);
-    s.v = load<Double8>(target + p.pixels + k, count) - (theta[1] * b * drawn + theta[3]);
+    const double *stretch = p.stretch + 2 * j, across = stretch[1];
+    s.u = load<Double8>(target + k, count) - (theta[0] * ((1.0 + stretch[0]) * a + across * b) * drawn + theta[2]);
+    s.v = load<Double8>(target + p.pixels + k, count) - (theta[1] * ((1.0 - stretch[0]) * b + across * a) * drawn + theta[3]);
     const Long8 counts = s.weight > 0.0;
     s.u = counts ? s.u : Double8{};
     s.v = counts ? s.v : Double8{};
     return s;
 }
 
-// Derivatives of the projection: A [rows, 2] by pose and intrinsics, a [2] by inverse depth.
+// Derivatives of the projection: A [rows, 2] by pose, stretch and intrinsics, a [2] by inverse depth.
 struct Jacobian {
     Float8 A[kMost][2], a[2];
 };
 
-SF_INLINE void differentiate(const Views& p, const Intrinsics& free, bool poses, size_t j, size_t k, size_t count,
+// Where the columns of a source begin among all: poses, then stretches, then intrinsics.
+struct Layout {
+    Free own;
+    size_t sources, pose, first, free;
+
+    Layout(Free own_, size_t sources_)
+        : own(own_), sources(sources_), pose(own.poses ? kPose : 0), first(own.columns()), free(first * sources) {}
+    size_t row(size_t j, size_t column) const {
+        if (column < pose) return pose * j + column;
+        if (column < first) return pose * sources + kStretch * j + column - pose;
+        return free + column - first;
+    }
+};
+
+// (u, v) of an image that is drawn by the stretch of a source.
+SF_INLINE void draw(const Views& p, size_t j, Float8 (&image)[2]) {
+    const double *stretch = p.stretch + 2 * j, aspect = p.theta[0] / p.theta[1];
+    const float along = stretch[0], uv = stretch[1] * aspect, vu = stretch[1] / aspect;
+    const Float8 u = image[0], v = image[1];
+    image[0] = (1.0f + along) * u + uv * v;
+    image[1] = (1.0f - along) * v + vu * u;
+}
+
+SF_INLINE void differentiate(const Views& p, const Intrinsics& free, Free parts, size_t j, size_t k, size_t count,
                              const Seen& s, Jacobian& out) {
     const double* T = p.T + 16 * j;
     const float fx = p.theta[0], fy = p.theta[1], k1 = p.theta[4];
@@ -60,18 +84,30 @@ SF_INLINE void differentiate(const Views& p, const Intrinsics& free, bool poses,
     J[0][1] = fy * iz * (2 * k1 * x * y);
     J[1][0] = fx * iz * (2 * k1 * x * y);
     J[1][1] = fy * iz * (drawn + 2 * k1 * y * y);
+    for (int i = 0; i < 2; ++i) draw(p, j, J[i]);
     const float t[3] = {static_cast<float>(T[3]), static_cast<float>(T[7]), static_cast<float>(T[11])};
-    const size_t first = poses ? kPose : 0;
+    const size_t first = parts.columns();
     for (int i = 0; i < 2; ++i) {
         J[2][i] = -(x * J[0][i] + y * J[1][i]);
         out.a[i] = t[0] * J[0][i] + t[1] * J[1][i] + t[2] * J[2][i];
-        if (!poses) continue;
+        if (!parts.poses) continue;
         for (int c = 0; c < 3; ++c) out.A[c][i] = J[c][i] * d;
         out.A[3][i] = X[1] * J[2][i] - X[2] * J[1][i];
         out.A[4][i] = X[2] * J[0][i] - X[0] * J[2][i];
         out.A[5][i] = X[0] * J[1][i] - X[1] * J[0][i];
     }
-    const Float8 own[2] = {x * drawn, y * drawn}, bent[2] = {fx * x * r2, fy * y * r2};
+    if (parts.stretch) {
+        const Float8 along[2] = {fx * x * drawn, -fy * y * drawn}, across[2] = {fx * y * drawn, fy * x * drawn};
+        for (int i = 0; i < 2; ++i) {
+            out.A[first - 2][i] = along[i];
+            out.A[first - 1][i] = across[i];
+        }
+    }
+    if (free.count == 0) return;
+    const double *stretch = p.stretch + 2 * j;
+    const float plus = 1.0 + stretch[0], minus = 1.0 - stretch[0], cross = stretch[1];
+    const Float8 own[2] = {(plus * x + cross * y) * drawn, (minus * y + cross * x) * drawn};
+    const Float8 bent[2] = {fx * (plus * x + cross * y) * r2, fy * (minus * y + cross * x) * r2};
     for (size_t f = 0; f < free.count; ++f) {
         const Float8 du = load<Float8>(free.dx + f * p.pixels + k, count);
         const Float8 dv = load<Float8>(free.dx + (free.count + f) * p.pixels + k, count);
@@ -108,20 +144,20 @@ struct Sums {  // of one source over one block
 };
 
 // One block of one source; writes the rows of E and scores of its pose, adds to the others.
-SF_INLINE void add_block(const Views& p, const Intrinsics& free, bool poses, double c2, size_t j, size_t begin,
+SF_INLINE void add_block(const Views& p, const Intrinsics& free, const Layout& layout, double c2, size_t j, size_t begin,
                          size_t end, const Equations& out, Sums& sums) {
-    const size_t first = poses ? kPose : 0, rows = first + free.count, own = first * p.sources;
+    const size_t first = layout.first, rows = first + free.count;
     const float inverse = static_cast<float>(1.0 / c2);
     Jacobian J;
     for (size_t k = begin; k < end; k += kLanes) {
         const size_t count = end - k;
         const Seen s = see(p, j, k, count);
-        differentiate(p, free, poses, j, k, count, s, J);
+        differentiate(p, free, layout.own, j, k, count, s, J);
         const Float8 r[2] = {single(s.u), single(s.v)};
         const Float8 weight = single(s.weight) / (1.0f + (r[0] * r[0] + r[1] * r[1]) * inverse);
         const Float8 wa[2] = {weight * J.a[0], weight * J.a[1]}, wr[2] = {weight * r[0], weight * r[1]};
         for (size_t i = 0, at = 0; i < rows; ++i) {
-            const size_t row = i < first ? first * j + i : own + i - first;
+            const size_t row = layout.row(j, i);
             const bool fresh = i < first || j == 0;
             const Float8 score = J.A[i][0] * wr[0] + J.A[i][1] * wr[1];
             const Float8 A[2] = {weight * J.A[i][0], weight * J.A[i][1]};
@@ -166,20 +202,19 @@ SF_SIMD void robust_cost(const float* squares, const double* weight, size_t coun
     cost *= c2;
 }
 
-SF_SIMD void linearise(const Views& p, const Intrinsics& free, bool poses, double c2, const Equations& out) {
-    const size_t first = poses ? kPose : 0, rows = first + free.count, own = first * p.sources;
-    const size_t side = own + free.count;
+SF_SIMD void linearise(const Views& p, const Intrinsics& free, Free own, double c2, const Equations& out) {
+    const Layout layout(own, p.sources);
+    const size_t rows = layout.first + free.count, side = layout.free + free.count;
     std::fill_n(out.H, side * side, 0.0);
     std::fill_n(out.g, side, 0.0);
     for (size_t begin = 0; begin < p.pixels; begin += kBlock)
         for (size_t j = 0; j < p.sources; ++j) {
             Sums sums = {};
-            add_block(p, free, poses, c2, j, begin, std::min(begin + kBlock, p.pixels), out, sums);
+            add_block(p, free, layout, c2, j, begin, std::min(begin + kBlock, p.pixels), out, sums);
             for (size_t i = 0, at = 0; i < rows; ++i) {
-                const size_t row = i < first ? first * j + i : own + i - first;
+                const size_t row = layout.row(j, i);
                 out.g[row] += sum(sums.g[i]);
-                for (size_t c = 0; c <= i; ++c, ++at)
-                    out.H[row * side + (c < first ? first * j + c : own + c - first)] += sum(sums.H[at]);
+                for (size_t c = 0; c <= i; ++c, ++at) out.H[row * side + layout.row(j, c)] += sum(sums.H[at]);
             }
         }
     for (size_t i = 0; i < side; ++i)

@@ -13,6 +13,13 @@ struct Views {
     const double* d;       // [N] inverse depth
     const double* target;  // [S, 2, N] px; anything where the weight is 0
     const double* weight;  // [S, N]
+    const double* stretch; // [S, 2] s, t: the image of a source is drawn by (1 + s, t; t, 1 - s)
+};
+
+// What is free of a source.
+struct Free {
+    bool poses, stretch;
+    size_t columns() const { return (poses ? 6 : 0) + (stretch ? 2 : 0); }
 };
 
 struct Intrinsics {
@@ -22,7 +29,7 @@ struct Intrinsics {
 };
 
 struct Equations {
-    double* H;      // [P, P] of poses and intrinsics
+    double* H;      // [P, P] of poses, stretches and intrinsics, in this order
     double* g;      // [P]
     float* E;       // [P, N] coupling with the inverse depths
     float* C;       // [N] of the inverse depths
@@ -38,7 +45,7 @@ void robust_cost(const float* squares, const double* weight, size_t count, doubl
                  double& total);
 
 // The normal equations, each observation weighted by its confidence and a Cauchy kernel of width^2 c2.
-void linearise(const Views& views, const Intrinsics& free, bool poses, double c2, const Equations& out);
+void linearise(const Views& views, const Intrinsics& free, Free own, double c2, const Equations& out);
 
 // S [P, P] = H - E C^-1 E^T and b [P] = g - E C^-1 w.
 void eliminate(const float* E, const float* C, const float* w, const double* H, const double* g, size_t rows,

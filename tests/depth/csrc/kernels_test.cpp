@@ -31,14 +31,15 @@ std::vector<T> numbers(size_t count, double low, double high, unsigned seed, siz
     return out;
 }
 
-void adjust(size_t sources, size_t pixels, size_t free_count, bool poses, size_t each) {
+void adjust(size_t sources, size_t pixels, size_t free_count, sf::Free own, size_t each) {
     const double theta[] = {50, 48, 30, 20, 0.1};
     const auto T = numbers<double>(16 * sources, -1, 1, 1, each), x = numbers<double>(2 * pixels, -1, 1, 2, each),
                d = numbers<double>(pixels, 0.1, 2, 3, each), target = numbers<double>(2 * sources * pixels, 0, 60, 4, each),
-               weight = numbers<double>(sources * pixels, 0, 1, 5, each), columns = numbers<double>(5 * free_count, 0, 1, 6, 0);
+               weight = numbers<double>(sources * pixels, 0, 1, 5, each),
+               stretch = numbers<double>(2 * sources, -0.1, 0.1, 8, each), columns = numbers<double>(5 * free_count, 0, 1, 6, 0);
     const auto dx = numbers<float>(2 * free_count * pixels, -1, 1, 7, each);
-    const sf::Views views{sources, pixels, theta, T.data(), x.data(), d.data(), target.data(), weight.data()};
-    const size_t rows = (poses ? 6 * sources : 0) + free_count;
+    const sf::Views views{sources, pixels, theta, T.data(), x.data(), d.data(), target.data(), weight.data(), stretch.data()};
+    const size_t rows = own.columns() * sources + free_count;
     std::vector<float> squares(sources * pixels), E(rows * pixels), C(pixels), w(pixels), scores(rows * pixels);
     std::vector<double> H(rows * rows), g(rows), S(rows * rows), b(rows), step(rows, 0.01), dd(pixels);
     sf::squared_residuals(views, squares.data());
@@ -46,7 +47,7 @@ void adjust(size_t sources, size_t pixels, size_t free_count, bool poses, size_t
     sf::robust_cost(squares.data(), weight.data(), squares.size(), 6.25, 1e4, cost, total);
     expect(each != 0 || (cost >= 0 && total >= 0), "costs are not negative");
     for (float* wanted : {scores.data(), static_cast<float*>(nullptr)}) {
-        sf::linearise(views, {free_count, dx.data(), columns.data()}, poses, 6.25,
+        sf::linearise(views, {free_count, dx.data(), columns.data()}, own, 6.25,
                       {H.data(), g.data(), E.data(), C.data(), w.data(), wanted});
         for (size_t i = 0; each == 0 && i < rows; ++i) expect(H[i * rows + i] >= 0, "diagonals are not negative");
     }
@@ -75,8 +76,8 @@ void sweep(size_t sources, size_t rows, size_t columns, size_t planes, size_t ea
 int main() {
     for (const size_t each : {0, 1, 3, 17}) {
         for (const size_t pixels : {1, 8, 13, 1030})
-            for (const bool poses : {false, true})
-                for (const size_t free_count : {0, 1, 4}) adjust(3, pixels, free_count, poses, each);
+            for (const sf::Free own : {sf::Free{false, false}, sf::Free{true, false}, sf::Free{true, true}})
+                for (const size_t free_count : {0, 1, 4}) adjust(3, pixels, free_count, own, each);
         for (const size_t rows : {2, 5})
             for (const size_t columns : {2, 8, 19}) sweep(2, rows, columns, 9, each), sweep(1, rows, columns, 1, each);
     }
