@@ -1,15 +1,14 @@
 """Fills gaps of an image as heat spreads: through what looks alike, hardly across edges (anisotropic diffusion).
 
 Every pixel that is not known becomes the mean of its neighbours, each weighted by the conductance of the link to it.
-That is the mean of the known pixels at which a random walk from it first arrives, so the spread of their values tells how
-ambiguous a gap is. With slopes the mean follows the planes that bound a gap. Solved from coarse to fine; the steps of
-each level are compiled, ``diffusion_reference`` says what they are.
+That is the mean of the known pixels at which a random walk from it first arrives, so the spread of their values tells
+how ambiguous a gap is. With slopes the mean follows the planes that bound a gap. Solved from coarse to fine; the
+steps of each level are compiled, ``diffusion_reference`` says what they are.
 """
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -19,10 +18,11 @@ from sf_interfaces.native import kernels
 from sf_interfaces.types import Float32, UInt8
 
 CHANNELS = 4  # images that are filled at the same time
-_EDGE = 0.006  # difference of Lab colours (0..1) from pixel to pixel at which a link conducts a quarter
+_EDGE = 0.008  # difference of Lab colours (0..1) from pixel to pixel at which a link conducts a quarter
 _LEAST = 1e-6  # conductance across the hardest edge
 _STEPS = 20  # of conjugate gradients at every level
 _COARSEST = 4  # px, a side of the coarsest level at least
+_COLUMNS, _ROWS = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])  # the two ends of every link
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +63,9 @@ class Diffusion:
     Args:
         image: RGB [H, W, 3] or mono [H, W].
         known: [H, W] bool, the pixels whose values are taken for granted; at least one.
+
+    Attributes:
+        links: those within gaps, from fine to coarse; the sides are multiples of two to the power of the levels.
     """
 
     def __init__(self, image: UInt8, known: np.ndarray) -> None:
@@ -75,9 +78,9 @@ class Diffusion:
         inner = Links(self._all.right.copy(), self._all.down.copy())
         inner.right[:, :-1] *= gap[:, :-1] & gap[:, 1:]
         inner.down[:-1] *= gap[:-1] & gap[1:]
-        self._inner = [Links(np.pad(inner.right, self._pad), np.pad(inner.down, self._pad))]
+        self.links = [Links(np.pad(inner.right, self._pad), np.pad(inner.down, self._pad))]
         for _ in range(steps):
-            self._inner.append(self._inner[-1].halved())
+            self.links.append(self.links[-1].halved())
 
     def fill(self, values: Float32, reach: float = np.inf, slope: Float32 | None = None) -> Float32:
         """Images without gaps, [H, W, 4].
@@ -89,12 +92,12 @@ class Diffusion:
         """
         levels = [self._bordered(values, slope, 1.0 / reach**2)]
         slopes = [None if slope is None else np.pad(slope, (*self._pad, (0, 0)))]
-        for _ in self._inner[1:]:
+        for _ in self.links[1:]:
             levels.append((_blocks(levels[-1][0]).sum(axis=(1, 3)), _blocks(levels[-1][1]).sum(axis=(1, 3))))
             last = slopes[-1]
             slopes.append(None if last is None else _blocks(last).mean(axis=(1, 3)) * np.float32(2.0))
         out = np.zeros_like(levels[-1][1])
-        for links, (ground, inflow), own in zip(self._inner[::-1], levels[::-1], slopes[::-1], strict=True):
+        for links, (ground, inflow), own in zip(self.links[::-1], levels[::-1], slopes[::-1], strict=True):
             if out.shape != inflow.shape:
                 out = out.repeat(2, axis=0).repeat(2, axis=1)
             if own is not None:
@@ -108,24 +111,16 @@ class Diffusion:
         known, gap = self._known, ~self._known
         ground = np.where(gap, np.float32(screen), np.float32(0))
         inflow = np.zeros(values.shape, np.float32)
-        upright = (slice(None), slice(None))
-        for axis, link in ((1, self._all.right), (0, self._all.down)):
-            first, second = (tuple(_cut(upright, axis, part)) for part in (slice(None, -1), slice(1, None)))
+        for axis, (link, first, second) in enumerate(((self._all.right, *_COLUMNS), (self._all.down, *_ROWS))):
             link = link[first]
             for here, there, sign in ((first, second, -1.0), (second, first, 1.0)):
                 w = np.where(gap[here] & known[there], link, np.float32(0))
                 ground[here] += w
                 inflow[here] += np.where(known[there][..., None], w[..., None] * values[there], np.float32(0))
                 if slope is not None:
-                    step = slope[..., 1 - axis]
+                    step = slope[..., axis]
                     inflow[here][..., 0] += np.float32(0.5 * sign) * w * (step[here] + step[there])
         return np.pad(ground, self._pad), np.pad(inflow, (*self._pad, (0, 0)))
-
-
-def _cut(index: tuple[slice, slice], axis: int, part: slice) -> list[slice]:
-    out = list(index)
-    out[axis] = part
-    return out
 
 
 def _follow(inflow: Float32, links: Links, slope: Float32) -> None:

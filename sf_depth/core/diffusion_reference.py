@@ -22,9 +22,7 @@ def system(right: Float32, down: Float32, ground: Float32) -> csr_array:
     return coo_array((np.concatenate([-w, -w, total]), (rows, columns)), shape=(at.size, at.size)).tocsr()
 
 
-def settle(
-    values: Float32, inflow: Float32, right: Float32, down: Float32, ground: Float32, steps: int
-) -> Float64:
+def settle(values: Float32, inflow: Float32, right: Float32, down: Float32, ground: Float32, steps: int) -> Float64:
     """Values [H, W, C] after so many steps of conjugate gradients; see ``diffusion.hpp``."""
     whole = system(right, down, ground)
     linked = np.flatnonzero(whole.diagonal() > 0)

@@ -22,9 +22,9 @@ from sf_depth.core.scalecov import MIN_OBSERVATIONS
 from sf_interfaces.errors import FormatError
 from sf_interfaces.types import DepthMap, Float32, Keyframe
 
-_REACH = 0.05  # image widths over which a plane that bounds a gap is lost
+_REACH = 0.3  # image widths over which a plane that bounds a gap is lost
 _CELL = 4  # px; planes are fitted to one pixel a cell
-_FARTHEST = 1.4  # inverse depth beyond nearly all that is seen, as a factor
+_FARTHEST = 1.2  # inverse depth beyond nearly all that is seen, as a factor
 # Variance of the log depth in a gap, in units of what it grows with: fitted to exact and sensor depth.
 _BOUNDS = 0.63  # variance of what bounds it: a walk may have crossed an edge where there is none in depth, or not
 _PLANES = 0.7  # square of the difference that the planes make
@@ -77,7 +77,9 @@ def _filled(image: np.ndarray, seen: DepthMap) -> tuple[Float32, Float32]:
     relative = np.where(support, seen.variance * d * d, 0.0).astype(np.float32)
     diffusion = Diffusion(image, support)
     slope = diffusion.fill(_slopes(d, support), _REACH * width)[..., :2]
-    along, level, square, known = np.moveaxis(diffusion.fill(np.stack([d, d, d * d, relative], axis=2), slope=slope), 2, 0)
+    along, level, square, known = np.moveaxis(
+        diffusion.fill(np.stack([d, d, d * d, relative], axis=2), slope=slope), 2, 0
+    )
     low, high = np.quantile(d[support], [0.01, 0.99])
     along, level = (np.clip(part, low / _FARTHEST, high * _FARTHEST) for part in (along, level))
     away = cv2.distanceTransform((~support).astype(np.uint8), cv2.DIST_L2, 3) / width
