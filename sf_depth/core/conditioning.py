@@ -125,6 +125,8 @@ def coarse_slopes(ratio: Float32, measured: np.ndarray, cell: int) -> tuple[np.n
     """Slopes of ratio [H, W] at one measured pixel a cell: (row, col) [N, 2] and ratio per px [N, 2] (right, down)."""
     index = _thinned(measured, cell)
     count = min(_NEIGHBOURS, len(index) - 1)
+    if count < 1:
+        return index, np.zeros((len(index), 2), np.float32)
     distance, near = cKDTree(index).query(index, k=count + 1, workers=-1)
     x, value = torch.from_numpy(index[:, ::-1].astype(np.float32)), torch.from_numpy(ratio[tuple(index.T)])
     spacing = torch.from_numpy(distance[:, min(6, count)].astype(np.float32))

@@ -106,6 +106,12 @@ def test_gaps_at_the_edges_of_a_room_are_as_sure_as_they_are_right() -> None:
     np.testing.assert_array_equal(again.variance, depth.variance)
 
 
+def test_four_pixels_beside_each_other_are_enough() -> None:
+    z = np.full((120, 160), np.nan)
+    z[60:62, 80:82] = 2.0
+    np.testing.assert_allclose(filled(GREY, z).z, 2.0, rtol=1e-3)
+
+
 def test_too_little_depth_is_refused() -> None:
     z = np.full((120, 160), np.nan)
     z[3, :3] = 2.0
