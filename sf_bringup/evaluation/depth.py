@@ -19,7 +19,11 @@ _STEPS = 20  # of the sparsification curve: 5 % of the pixels each
 
 @dataclass(frozen=True, slots=True)
 class DepthError:
-    """Depth error over the pixels valid in both maps; calibration where variance is known, else NaN."""
+    """Depth error over the pixels valid in both maps; calibration where variance is known, else NaN.
+
+    Where the median aligns, the scale is free, and the ratio of two medians carries what a few wrong pixels do to it
+    into every pixel. Calibration is therefore measured after the median of ratios.
+    """
 
     absrel: float  # percent
     inlier: float  # percent of pixels within the 1.03 ratio
@@ -75,6 +79,7 @@ def depth_error(estimate: DepthMap, reference: DepthMap, alignment: str = "none"
     p, stretch = align_depth(estimate.z[both].astype(np.float64), g, alignment)
     error, ratio = np.abs(p - g), np.maximum(p / g, g / p)
     sigma = None if estimate.variance is None else stretch * np.sqrt(estimate.variance[both].astype(np.float64))
+    free = float(np.median(g / p)) if alignment == "median" else 1.0
     return DepthError(
         absrel=100 * float((error / g).mean()),
         inlier=100 * float((ratio < INLIER_RATIO).mean()),
@@ -82,7 +87,7 @@ def depth_error(estimate: DepthMap, reference: DepthMap, alignment: str = "none"
         rmse=float(np.sqrt((error**2).mean())),
         delta1=100 * float((ratio < DELTA1_RATIO).mean()),
         density=100 * float(both.sum() / reference.valid.sum()),
-        **calibration(error, sigma),
+        **calibration(np.abs(free * p - g), None if sigma is None else free * sigma),
         pixels=int(both.sum()),
     )
 

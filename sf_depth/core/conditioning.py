@@ -121,6 +121,20 @@ def _slopes(
     return slope
 
 
+def coarse_slopes(ratio: Float32, measured: np.ndarray, cell: int) -> tuple[np.ndarray, Float32]:
+    """Slopes of ratio [H, W] at one measured pixel a cell: (row, col) [N, 2] and ratio per px [N, 2] (right, down)."""
+    index = _thinned(measured, cell)
+    count = min(_NEIGHBOURS, len(index) - 1)
+    if count < 1:
+        return index, np.zeros((len(index), 2), np.float32)
+    distance, near = cKDTree(index).query(index, k=count + 1, workers=-1)
+    x, value = torch.from_numpy(index[:, ::-1].astype(np.float32)), torch.from_numpy(ratio[tuple(index.T)])
+    spacing = torch.from_numpy(distance[:, min(6, count)].astype(np.float32))
+    parts = torch.arange(len(x)).split(_CHUNK)
+    nearest = torch.from_numpy(near[:, 1:])
+    return index, torch.cat(each(lambda part: _slopes(x, value, nearest, spacing, part), parts)).numpy()
+
+
 def choose(observed: Observations, center: Float64, count: int, excluded: Float64 | None = None) -> torch.Tensor:
     """The observations each tile is conditioned on, [B, count], the least screened first.
 

@@ -1,4 +1,8 @@
-"""From triangulated to complete depth: a monocular base where there is a model, ScaleCov for its scale."""
+"""From triangulated to complete depth: gaps are filled from what bounds them, or by a monocular model and ScaleCov.
+
+What several views see is dense and has gaps where nothing could be matched. Depth and its planes diffuse into them
+(:mod:`diffusion`), through what looks alike. How sure that is tells the diffusion, too.
+"""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -9,22 +13,30 @@ import cv2
 import numpy as np
 
 from sf_depth.config import DepthConfig
+from sf_depth.core.conditioning import coarse_slopes
+from sf_depth.core.diffusion import CHANNELS, Diffusion
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.monodepth import MonoDepth, load_monodepth
-from sf_interfaces.types import DepthMap, Float32, Float64, Keyframe
+from sf_depth.core.parallel import one_torch_thread
+from sf_depth.core.scalecov import MIN_OBSERVATIONS
+from sf_interfaces.errors import FormatError
+from sf_interfaces.types import DepthMap, Float32, Keyframe
 
-# Relative deviation for every image width of distance from triangulated depth: another surface may be there,
-# which no interpolation of what was seen can know. What poses and calibration get wrong around a gap they get wrong
-# in it, too: the relative variance of the nearest triangulated pixel is added.
-_UNSEEN = 1.0
-_LEAST_WINDOW = 4.0  # px, half the side of the smallest window that surfaces are compared in
+_REACH = 0.3  # image widths over which a plane that bounds a gap is lost
+_CELL = 4  # px; planes are fitted to one pixel a cell
+_FARTHEST = 1.2  # inverse depth beyond nearly all that is seen, as a factor
+# Variance of the log depth in a gap, in units of what it grows with: fitted to exact and sensor depth.
+_BOUNDS = 0.63  # variance of what bounds it: a walk may have crossed an edge where there is none in depth, or not
+_PLANES = 0.7  # square of the difference that the planes make
+_SEEN = 0.8  # relative variance of what bounds it
+_AWAY = 1.8  # relative deviation for every image width of distance from what is seen
 
 
 class Filler:
     """Completes keyframes whose depth has gaps.
 
     Args:
-        config: see :class:`DepthConfig`; ``monodepth`` names the base.
+        config: see :class:`DepthConfig`; ``monodepth`` names the base, ``none``: gaps are filled by diffusion.
 
     Raises:
         ConfigError: that model is not installed.
@@ -43,48 +55,55 @@ class Filler:
             FormatError: it has too little depth to start from.
         """
         seen = keyframe.depth
-        base = None
+        assert seen is not None and seen.variance is not None
+        if int(seen.valid.sum()) < MIN_OBSERVATIONS:
+            raise FormatError(f"keyframe {keyframe.stamp_ns}: fewer than {MIN_OBSERVATIONS} pixels have depth")
+        z, variance = _filled(keyframe.image, seen)
         if self._model is not None:
             guessed = self._model(keyframe.image, keyframe.camera, seen).z
             base = np.nan_to_num(guessed, nan=float(np.nanmedian(guessed)))
-        full = self._completer.complete(keyframe, base)
-        assert full.depth is not None and full.depth.variance is not None
-        assert seen is not None and seen.variance is not None
-        away, owner = _nearest(seen.valid)
-        unseen = (_UNSEEN * away / keyframe.camera.width) ** 2
-        unseen += np.where(seen.valid, 0.0, (seen.variance / seen.z**2)[owner] + _disagreement(seen.z, away))
-        variance = full.depth.variance + unseen * full.depth.z**2
-        return replace(full, depth=DepthMap(full.depth.z, variance, full.depth.scale))
+            full = self._completer.complete(keyframe, base).depth
+            assert full is not None
+            variance = np.where(seen.valid, variance, full.variance + variance * (full.z / z) ** 2)
+            z = full.z
+        return replace(keyframe, depth=DepthMap(z, variance, seen.scale))
 
 
-def _nearest(valid: np.ndarray) -> tuple[Float32, tuple[np.ndarray, np.ndarray]]:
-    """Distance [H, W] px of every pixel to the nearest valid one, and the row and column of that one."""
-    gaps = (~valid).astype(np.uint8)
-    away, label = cv2.distanceTransformWithLabels(gaps, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
-    place = np.zeros(int(label.max()) + 1, np.int64)
-    place[label[valid]] = np.flatnonzero(valid)
-    return np.asarray(away), np.unravel_index(place[label], valid.shape)
+def _filled(image: np.ndarray, seen: DepthMap) -> tuple[Float32, Float32]:
+    """Depth and variance without gaps, [H, W] each."""
+    assert seen.variance is not None
+    width, support = image.shape[1], _support(seen.valid)
+    d = np.where(support, 1.0 / np.where(support, seen.z, 1.0), 0.0).astype(np.float32)
+    relative = np.where(support, seen.variance * d * d, 0.0).astype(np.float32)
+    diffusion = Diffusion(image, support)
+    slope = diffusion.fill(_slopes(d, support), _REACH * width)[..., :2]
+    along, level, square, known = np.moveaxis(
+        diffusion.fill(np.stack([d, d, d * d, relative], axis=2), slope=slope), 2, 0
+    )
+    low, high = np.quantile(d[support], [0.01, 0.99])
+    along, level = (np.clip(part, low / _FARTHEST, high * _FARTHEST) for part in (along, level))
+    away = cv2.distanceTransform((~support).astype(np.uint8), cv2.DIST_L2, 3) / width
+    unsure = _BOUNDS * np.maximum(square / level**2 - 1.0, 0.0) + _PLANES * np.log(along / level) ** 2
+    unsure += _SEEN * known + (_AWAY * away) ** 2
+    z = np.where(seen.valid, seen.z, 1.0 / along)
+    return z, np.where(seen.valid, seen.variance, unsure * z * z)
 
 
-def _disagreement(z: Float32, away: Float32) -> Float32:
-    """Variance [H, W] of the log depth seen around each gap's pixel, up to twice its distance [H, W] px from it.
+def _support(valid: np.ndarray) -> np.ndarray:
+    """What gaps are filled from, [H, W] bool: their rims are the least sure, and left out where more is known."""
+    inner = cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    return inner if 4 * inner.sum() > valid.sum() else valid
 
-    What a gap hides belongs to one of the surfaces around it, and which one is a guess. 0 where depth is seen.
-    """
-    seen = np.isfinite(z)
-    log = np.log(np.where(seen, z, 1.0)).astype(np.float64)
-    row, col = np.nonzero(~seen)
-    half = np.maximum(2.0 * away[row, col], _LEAST_WINDOW).astype(np.int64)
-    top, left = np.maximum(row - half, 0), np.maximum(col - half, 0)
-    bottom, right = np.minimum(row + half + 1, z.shape[0]), np.minimum(col + half + 1, z.shape[1])
 
-    def around(values: np.ndarray) -> Float64:
-        """Sum over the window of every pixel, [G]."""
-        total = cv2.integral(values, sdepth=cv2.CV_64F)
-        return np.asarray(total[bottom, right] - total[top, right] - total[bottom, left] + total[top, left])
-
-    count = np.maximum(around(seen.astype(np.float64)), 1.0)
-    mean = around(log) / count
-    out = np.zeros(z.shape, np.float32)
-    out[row, col] = np.maximum(around(log * log) / count - mean * mean, 0.0)
+def _slopes(d: Float32, support: np.ndarray) -> Float32:
+    """Slopes of the planes [H, W, 4] that the supporting pixels lie on, (right, down, 0, 0) per px: of the nearest."""
+    out = np.zeros((*d.shape, CHANNELS), np.float32)
+    with one_torch_thread():
+        index, slope = coarse_slopes(d, support, _CELL)
+    missing = np.ones(d.shape, np.uint8)
+    missing[tuple(index.T)] = 0
+    _, label = cv2.distanceTransformWithLabels(missing, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    owner = np.zeros(int(label.max()) + 1, np.int64)
+    owner[label[tuple(index.T)]] = np.arange(len(index))
+    out[..., :2] = slope[owner[label]]
     return out

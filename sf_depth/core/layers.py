@@ -17,7 +17,10 @@ from sf_depth.core.parallel import each
 _TRUST = 6.0  # a plane is extended this many spacings of its observations; at this distance it counts half
 _CLIP = 1.3  # and changes by this factor at most
 _AGREE = 0.03  # relative deviation of planes that belong to one surface
-_SUSPECT = 1.0  # log distance behind its surroundings at which an observation counts half
+_SUSPECT = (
+    1.0  # log distance behind its surroundings at which an observation counts half, with scattered ones half that
+)
+_NEARER = 0.065  # what scattered observations move the median by, towards the near
 _SAMPLES = (1 / 6, 1 / 3, 1 / 2, 2 / 3, 5 / 6)  # where the colour is looked up between a pixel and an observation
 _BARRIER = 0.7  # how much a colour step in between counts against one at the ends
 _CHUNK = 8192  # observations weighed at once; fewer keep the cores waiting for the interpreter
@@ -70,11 +73,16 @@ def at(image: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
     return image[x[..., 1].long(), x[..., 0].long()]
 
 
-def layer(seen: Neighbourhood, reliability: torch.Tensor, spacing: torch.Tensor) -> Layer:
-    """Weighted median of what the planes predict, then the average of those that agree with it."""
+def layer(seen: Neighbourhood, reliability: torch.Tensor, spacing: torch.Tensor, apart: float) -> Layer:
+    """Weighted median of what the planes predict, then the average of those that agree with it.
+
+    Args:
+        apart: px, up to 1, by which depth may lie beside where the image shows it. Then points of the background lie
+            on what is in front, which the camera sees: the median is a little on the near side.
+    """
     trust = seen.affinity * reliability[seen.ids][..., None]
     sharp = trust / (seen.square + 1e-3)
-    ratio = _smooth(seen, _median(seen.value, sharp), trust, spacing)
+    ratio = _smooth(seen, _quantile(seen.value, sharp, 0.5 + _NEARER * apart), trust, spacing)
     off = torch.log(seen.value / ratio[:, None])
     return Layer(ratio, (sharp * off * off).sum(dim=1) / sharp.sum(dim=1))
 
@@ -86,26 +94,27 @@ def _smooth(seen: Neighbourhood, start: torch.Tensor, trust: torch.Tensor, spaci
     return (weight * seen.value).sum(dim=1) / weight.sum(dim=1)
 
 
-def _median(value: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """Weighted median over the observations, [B, M]; their order is that at each tile's middle pixel."""
+def _quantile(value: torch.Tensor, weight: torch.Tensor, share: float = 0.5) -> torch.Tensor:
+    """Weighted quantile over the observations, [B, M]; their order is that at each tile's middle pixel."""
     order = value[..., value.shape[2] // 2].argsort(dim=1)[..., None].expand_as(value)
     total = weight.gather(1, order).cumsum(dim=1)
-    middle = (total < 0.5 * total[:, -1:]).sum(dim=1, keepdim=True)
+    middle = (total < share * total[:, -1:]).sum(dim=1, keepdim=True)
     return value.gather(1, order.gather(1, middle))[:, 0]
 
 
-def reliability(observed: Observations, color: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def reliability(observed: Observations, color: torch.Tensor, apart: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Weight of every observation, [N], and the ratio of the layer that it lies on, [N].
 
     A point that lies behind all that surround it was seen past an edge or through glass: the sensor does not
     stand where the camera does, and the camera sees what is in front.
     """
     ids = torch.cat([torch.arange(len(observed.ratio))[:, None], observed.near], dim=1)
+    suspect = _SUSPECT / (1.0 + apart)
 
     def weigh(part: torch.Tensor) -> tuple[Neighbourhood, torch.Tensor]:
         seen = look(observed, part, observed.x[part[:, :1]], color)
-        around = _median(seen.value[:, 1:], seen.affinity[:, 1:] / (seen.square[:, 1:] + 1e-3))[:, 0]
-        behind = torch.log(around / observed.ratio[part[:, 0]]).clamp_min(0.0) / _SUSPECT
+        around = _quantile(seen.value[:, 1:], seen.affinity[:, 1:] / (seen.square[:, 1:] + 1e-3))[:, 0]
+        behind = torch.log(around / observed.ratio[part[:, 0]]).clamp_min(0.0) / suspect
         return seen, 1.0 / (1.0 + behind * behind)
 
     def settle(seen: Neighbourhood) -> torch.Tensor:

@@ -110,6 +110,7 @@ class _Regression:
     residual: torch.Tensor  # [N] log(z / base) less the mean
     covariance: PixelCovariance
     typical: float
+    apart: float  # px, up to 1, that depth may lie beside where the image shows it
     config: DepthConfig
 
     @staticmethod
@@ -126,13 +127,14 @@ class _Regression:
         known = np.where(measured, z, 1.0)
         observed = observe(np.where(measured, base / known, 0.0), variance / known**2, measured)
         color = _colors(image, config.color_scale)
-        weight, ratio = reliability(observed, color)
+        apart = min(config.registration_sigma, 1.0)
+        weight, ratio = reliability(observed, color, apart)
         residual = torch.log(ratio / observed.ratio)
         spacing = float(observed.spacing[: observed.densest].median())
         model = covariance or make_covariance(config)
         length = config.length_scale * spacing
         typical = max(float((residual[: observed.densest] ** 2).median()), _MIN_AMPLITUDE)
-        return _Regression(observed, color, weight, residual, model(image, length), typical, config)
+        return _Regression(observed, color, weight, residual, model(image, length), typical, apart, config)
 
     def image(self, measured: np.ndarray) -> tuple[Float32, Float32]:
         """log(z / base) and its calibrated variance wherever a pixel is missing, [H, W] each."""
@@ -160,7 +162,7 @@ class _Regression:
     def _regress(self, ids: torch.Tensor, x: torch.Tensor) -> tuple[Float32, Float32]:
         """log(z / base) of pixels [B, M, 2] given observations [B, K], and its variance before calibration."""
         seen = look(self.observed, ids, x, self.color)
-        layers = layer(seen, self.weight, self.observed.spacing)
+        layers = layer(seen, self.weight, self.observed.spacing, self.apart)
         log_mean = -torch.log(layers.ratio)
         center = x.mean(dim=1, keepdim=True)
         near, ratio = self.observed.x[ids], self.observed.ratio[ids]

@@ -6,6 +6,7 @@
 #include <algorithm>
 
 #include "dense_ba.hpp"
+#include "diffusion.hpp"
 #include "plane_sweep.hpp"
 
 namespace nb = nanobind;
@@ -104,6 +105,20 @@ Out<float> best_paths(In<float, -1, -1, -1> cost, In<float, -1, -1> image, bool 
     return total.give();
 }
 
+Out<float> settle(In<float, -1, -1, 4> values, In<float, -1, -1, 4> inflow, In<float, -1, -1> right,
+                 In<float, -1, -1> down, In<float, -1, -1> ground, size_t steps) {
+    const size_t h = values.shape(0), w = values.shape(1);
+    const auto fits = [&](const auto& a) { return a.shape(0) == h && a.shape(1) == w; };
+    require(fits(inflow) && fits(right) && fits(down) && fits(ground), "the images differ in size");
+    Made<float> settled({h, w, sf::kChannels});
+    std::copy_n(values.data(), values.size(), settled.get());
+    {
+        nb::gil_scoped_release free;
+        sf::settle({h, w, right.data(), down.data(), ground.data(), inflow.data()}, steps, settled.get());
+    }
+    return settled.give();
+}
+
 }  // namespace
 
 NB_MODULE(_native, m) {
@@ -121,4 +136,6 @@ NB_MODULE(_native, m) {
           nb::arg("unseen"), nb::arg("d"));
     m.def("best_paths", &best_paths, nb::arg("cost"), nb::arg("image"), nb::arg("upright"), nb::arg("bend"),
           nb::arg("jump"), nb::arg("edge"));
+    m.def("settle", &settle, nb::arg("values"), nb::arg("inflow"), nb::arg("right"), nb::arg("down"), nb::arg("ground"),
+          nb::arg("steps"));
 }
