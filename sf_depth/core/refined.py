@@ -18,7 +18,7 @@ from sf_depth.core.parallel import each
 from sf_depth.core.plane_sweep import Compared
 from sf_interfaces.types import Float32
 
-_STEPS = (2.0, 1.0, 0.5, 0.25)  # planes
+_STEPS = (2.0, 1.0, 0.5, 0.25, 0.5, 0.25)  # planes; fine steps once more, where the first led away
 _GAIN = 0.02  # of dissimilarity that a step of a plane or more has to bring
 _AROUND = (-4, -2, 0, 2, 4)  # px: the rows and columns of the pixels that are counted together
 _ALIKE = 10.0  # grey levels at which a pixel around counts 1 / e
