@@ -9,12 +9,14 @@ is below.)
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Float64
+
+_CLOSE = 0.5  # of the least baseline of a good neighbour
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,3 +59,17 @@ def before_and_after(
     first = max(half, count - len(later))
     chosen = earlier[:first]
     return sorted(chosen + later[: count - len(chosen)])
+
+
+def nearest(
+    index: int, poses: Sequence[Float64], scene_depth: float, limits: NeighborLimits, taken: Sequence[int], count: int
+) -> list[int]:
+    """The ``count`` poses next to pose ``index`` that are not taken, nearest first: they see what passes close by.
+
+    They face the same way, and half the baseline of a good neighbour is enough.
+    """
+    close = replace(limits, min_baseline=_CLOSE * limits.min_baseline)
+    others = [j for j in range(len(poses)) if j != index and j not in taken]
+    good = find_good_neighbors(poses[index], [poses[j] for j in others], scene_depth, close, len(others))
+    away = [(float(np.linalg.norm(poses[others[k]][:3, 3] - poses[index][:3, 3])), others[k]) for k in good]
+    return [j for _, j in sorted(away)[:count]]

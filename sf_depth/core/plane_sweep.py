@@ -41,19 +41,27 @@ def sweep_planes(reference: UInt8, sources: Sequence[UInt8], at: Estimate, reduc
         sources: the images that ``at.T`` places.
         at: geometry so far; its inverse depths give the range of the sweep.
     """
+    return sweep(compare(reference, sources, at, reduction), planes_of(at, reduction))
+
+
+def compare(reference: UInt8, sources: Sequence[UInt8], at: Estimate, reduction: int) -> Compared:
+    """The images, reduced, with the geometry by which they are compared."""
     height, width = reference.shape[0] // reduction, reference.shape[1] // reduction
     size = (width, height)
     first, *others = (
         cv2.resize(grey(image), size, interpolation=cv2.INTER_AREA).astype(np.float32)
         for image in (reference, *sources)
     )
-    planes = _planes(at, reduction)
-    part = Compared(first, others, at, reference.shape[1] / width, reference.shape[0] / height)
+    return Compared(first, others, at, reference.shape[1] / width, reference.shape[0] / height)
+
+
+def sweep(part: Compared, planes: Float32) -> Float32:
+    """Inverse depth [h, w] by the planes [D] on which the images look most alike."""
     cost = np.stack(each(part.dissimilarity, planes), axis=2)  # [h, w, D]
-    return _winner(_aggregated(cost, cv2.GaussianBlur(first, (0, 0), 0.7)), planes)
+    return _winner(_aggregated(cost, part.smooth), planes)
 
 
-def _planes(at: Estimate, reduction: int) -> Float32:
+def planes_of(at: Estimate, reduction: int) -> Float32:
     """Inverse depths that are evenly spaced in the image, [D]."""
     median, low, high = np.quantile(at.inverse_depth, [0.5, 0.01, 0.99])
     nearest, farthest = max(_NEAREST[0] * high, _NEAREST[1] * median), max(_FARTHEST * low, 1e-3 * median)
@@ -72,6 +80,7 @@ class Compared:
         T = at.T.astype(np.float32)
         self.rotated = np.stack([R[:3, :2] @ x + R[:3, 2:3] for R in T])  # [S, 3, N]
         self.t = np.ascontiguousarray(T[:, :3, 3])
+        self.smooth = cv2.GaussianBlur(first, (0, 0), 0.7)  # edges, not noise, tell surfaces apart
         self.mean = cv2.blur(first, WINDOW)
         self.scale = 1.0 / np.sqrt(cv2.blur(first * first, WINDOW) - self.mean**2 + np.float32(NOISE))
 
@@ -80,8 +89,16 @@ class Compared:
 
         Two, since what one source does not see another does.
         """
+        return self._dissimilarity(self.rotated, d)
+
+    def dissimilarity_of(self, d: Float32) -> Float32:
+        """The same of a surface: every pixel has its own inverse depth, d [h, w]."""
+        return self._dissimilarity(self.rotated + self.t[:, :, None] * d.reshape(-1), np.float32(0))
+
+    def _dissimilarity(self, X: Float32, d: np.float32) -> Float32:
+        """Points X + t d, in units of the depth in the reference, X [S, 3, N]."""
         images = (self.first, self.mean, self.scale, self.others)
-        geometry = (self.rotated, self.t, self.theta, self.zoom)
+        geometry = (X, self.t, self.theta, self.zoom)
         return np.asarray(kernels("sf_depth").dissimilarity(*images, *geometry, MIN_Z, NOISE, UNSEEN, d))
 
 

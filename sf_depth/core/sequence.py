@@ -17,7 +17,7 @@ from sf_depth.config import DepthConfig
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.filling import Filler
 from sf_depth.core.mvd import CONTRADICTED, MultiViewDepth
-from sf_depth.core.neighbors import NeighborLimits, before_and_after
+from sf_depth.core.neighbors import NeighborLimits, before_and_after, nearest
 from sf_depth.core.overlap import sighted_depth
 from sf_depth.core.swept import Consensus, relative, swept
 from sf_interfaces.errors import SceneFactoryError
@@ -33,7 +33,8 @@ _NOTHING_MEASURED = "keyframe without measured depth, as between the sweeps of a
 class Setting(Protocol):
     """What tells the two modes apart."""
 
-    least_neighbors: ClassVar[int]  # good neighbours a reference needs
+    least_neighbors: ClassVar[int]  # neighbours a reference needs
+    nearest: ClassVar[int]  # that are taken beside the good ones because they are close by
 
     def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
         """Whether a frame becomes a reference; ``last`` was one, the scene is ``depth`` away."""
@@ -56,6 +57,7 @@ class SlamSetting:
     """Every keyframe of the tracker gets depth, by a sweep at its pose that other keyframes confirm."""
 
     least_neighbors: ClassVar[int] = 1  # what one source alone tells others still have to confirm
+    nearest: ClassVar[int] = 2  # far sources lose sight of what is near, and of what the camera turns away from
 
     def __init__(self) -> None:
         self._consensus = Consensus()
@@ -86,6 +88,7 @@ class PosedSetting:
 
     spacing: float
     least_neighbors: ClassVar[int] = 2  # tau_nb of the paper
+    nearest: ClassVar[int] = 0
 
     def wants(self, frame: Keyframe, last: Keyframe | None, depth: float) -> bool:
         """It moved or turned enough since the last one."""
@@ -180,6 +183,7 @@ class SequenceDepth:
         self._depth = self._setting.scene_depth(frame, others) or self._depth
         poses = [other.T_map_camera for other in self._frames]
         chosen = before_and_after(index, poses, self._depth, self._limits, self._config.max_sources)
+        chosen += nearest(index, poses, self._depth, self._limits, chosen, self._setting.nearest)
         if len(chosen) < self._setting.least_neighbors:
             return self._skip("too few good neighbours: the camera hardly moves, or turns too fast")
         try:

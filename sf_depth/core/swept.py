@@ -15,7 +15,8 @@ from sf_depth.core import pinhole
 from sf_depth.core.agreement import Swept, confirmed
 from sf_depth.core.dense_ba import Estimate
 from sf_depth.core.matching import grey, pixel_grid, sample
-from sf_depth.core.plane_sweep import sweep_planes
+from sf_depth.core.plane_sweep import compare, planes_of, sweep
+from sf_depth.core.refined import refined
 from sf_interfaces.errors import InsufficientParallax
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Float32, Float64, Keyframe, UInt8
@@ -49,7 +50,8 @@ def swept(frame: Keyframe, sources: list[Keyframe]) -> Swept:
         raise InsufficientParallax("no neighbour shows the landmarks where its pose says: the poses contradict them")
     at = Estimate(pinhole.theta_of(frame.camera), T[good], 1.0 / points[:, 2])
     reduction = max(1, round(frame.camera.width / _WIDTH))
-    d = sweep_planes(frame.image, [sources[j].image for j in good], at, reduction)
+    part, planes = compare(frame.image, [sources[j].image for j in good], at, reduction), planes_of(at, reduction)
+    d = refined(part, sweep(part, planes), float(planes[1] - planes[0]))
     return Swept(frame, d, float(np.linalg.norm(T[good, :3, 3], axis=1).max()))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sf_depth.core.monodepth import StructurePrior, load_monodepth
-from sf_depth.core.neighbors import NeighborLimits, before_and_after, find_good_neighbors
+from sf_depth.core.neighbors import NeighborLimits, before_and_after, find_good_neighbors, nearest
 from sf_depth.core.outliers import lonely
 from sf_depth.core.scale import from_translations
 from sf_interfaces.errors import ConfigError, InsufficientParallax
@@ -35,6 +35,13 @@ def test_neighbours_come_from_both_sides_where_they_can() -> None:
     poses = [pose(0.1 * k) for k in range(7)]
     assert before_and_after(3, poses, 1.0, LIMITS, 4) == [0, 1, 5, 6]
     assert before_and_after(0, poses, 1.0, LIMITS, 4) == [1, 2, 3]
+
+
+def test_the_nearest_of_the_others_see_what_passes_close_by() -> None:
+    poses = [pose(0.02 * k) for k in range(7)]
+    assert nearest(3, poses, 1.0, LIMITS, [0, 1, 5, 6], 2) == [2, 4]
+    assert nearest(0, poses, 1.0, LIMITS, [6], 3) == [1, 2, 3]
+    assert nearest(0, [*poses[:3], pose(0.001), pose(0.03, yaw_deg=40)], 1.0, LIMITS, [1], 3) == [2]
 
 
 def test_translations_give_the_scale_in_spite_of_a_wrong_one() -> None:
