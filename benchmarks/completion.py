@@ -32,7 +32,7 @@ from sf_interfaces.geometry.lidar import project_sweep
 from sf_interfaces.types import Camera, DepthMap, Float64, Keyframe, SparseDepth, UInt8
 
 SENSORS = {  # what is known of them besides their images
-    "stereo2015": {"registration_sigma": 1.0},  # seen on two of the four frames
+    "stereo2015": {"registration_sigma": 1.0},  # seen on two of the four frames; what it moves the median by, on all
     "rgbd holes": {"depth_sigma": 0.01},  # structured light at 2.5 m: 0.07 px of disparity at a baseline of 75 mm
     "simulated holes": {"depth_sigma": 0.01},
 }
