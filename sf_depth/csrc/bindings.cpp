@@ -112,10 +112,9 @@ Out<float> settle(In<float, -1, -1, 4> values, In<float, -1, -1, 4> inflow, In<f
     require(fits(inflow) && fits(right) && fits(down) && fits(ground), "the images differ in size");
     Made<float> settled({h, w, sf::kChannels});
     std::copy_n(values.data(), values.size(), settled.get());
-    {
-        nb::gil_scoped_release free;
+    alone([&] {
         sf::settle({h, w, right.data(), down.data(), ground.data(), inflow.data()}, steps, settled.get());
-    }
+    });
     return settled.give();
 }
 
