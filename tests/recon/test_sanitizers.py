@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 KERNELS = {
-    "depth": ("dense_ba", "plane_sweep"),
+    "depth": ("dense_ba", "diffusion", "plane_sweep"),
     "recon": ("color_decoder", "ipr_bins", "ipr_cpu", "point_grid", "rows", "view_blend"),
     "tracking": ("align", "bundle", "pose", "reproject", "surface"),
 }

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "dense_ba.hpp"
+#include "diffusion.hpp"
 #include "plane_sweep.hpp"
 
 namespace {
@@ -71,6 +72,16 @@ void sweep(size_t sources, size_t rows, size_t columns, size_t planes, size_t ea
         sf::best_paths({rows, columns, planes, cost.data(), first.data()}, upright, {0.1f, 1, 8}, total.data());
 }
 
+void diffuse(size_t rows, size_t columns, size_t each) {
+    const size_t area = rows * columns;
+    const auto right = numbers<float>(area, 0, 1, 21, each), down = numbers<float>(area, 0, 1, 22, each),
+               ground = numbers<float>(area, 0, 1, 23, each),
+               inflow = numbers<float>(sf::kChannels * area, -1, 1, 24, each);
+    auto values = numbers<float>(sf::kChannels * area, -1, 1, 25, 0);
+    sf::settle({rows, columns, right.data(), down.data(), ground.data(), inflow.data()}, 20, values.data());
+    for (size_t i = 0; each == 0 && i < values.size(); ++i) expect(std::isfinite(values[i]), "values are finite");
+}
+
 }  // namespace
 
 int main() {
@@ -80,6 +91,8 @@ int main() {
                 for (const size_t free_count : {0, 1, 4}) adjust(3, pixels, free_count, own, each);
         for (const size_t rows : {2, 5})
             for (const size_t columns : {2, 8, 19}) sweep(2, rows, columns, 9, each), sweep(1, rows, columns, 1, each);
+        for (const size_t rows : {1, 2, 7})
+            for (const size_t columns : {1, 3, 20}) diffuse(rows, columns, each);
     }
     std::puts("all kernels behave");
 }
