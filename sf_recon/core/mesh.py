@@ -27,7 +27,7 @@ _TRUNCATION = 4.0  # of the signed distance, in voxels
 _BLOCK = 8  # voxels per side of a block
 _TRIM = 3.0  # a triangle farther than this from every drawn point is invented, in voxels
 _MAX_DEPTH = 10  # of the Poisson octree: 1024 cells per side
-_SMALLEST = 30  # triangles; a smaller piece is noise
+_SMALLEST = 120  # triangles; a smaller piece is noise
 
 Mesh = o3d.geometry.TriangleMesh
 
