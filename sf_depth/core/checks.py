@@ -16,7 +16,7 @@ from sf_depth.core.start import Size
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Float32, Float64
 
-_CROSS = 2.0  # px; a match and its match back must meet within it
+_CROSS = 1.5  # px; a match and its match back must meet within it
 _EXACT = 1.0  # px; the same of those that cameras are adjusted to
 _STATIC = 3.84  # px^2; squared distance to the epipolar line, both ways
 _PARALLAX = np.cos(np.radians(0.6))  # rays closer than this say nothing about depth
