@@ -16,25 +16,21 @@ from sf_depth.core.start import Size
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Float32, Float64
 
-_CROSS = 2.0  # px; a match and its match back must meet within it
-_EXACT = 1.0  # px; the same of those that cameras are adjusted to
+_CROSS = 1.0  # px; a match and its match back must meet within it
 _STATIC = 3.84  # px^2; squared distance to the epipolar line, both ways
 _PARALLAX = np.cos(np.radians(0.6))  # rays closer than this say nothing about depth
 _EPIPOLE = np.radians(4.0)  # rays nearer to the epipole pass every epipolar check
 _LEAST_CONFIDENCE = 0.1
 
 
-def cross_check(found: Correspondence, size: Size) -> tuple[Float32, np.ndarray]:
-    """Confidence [h, w] of the matches that come back to where they started, for images of ``size``.
-
-    And which of them do so exactly.
-    """
+def cross_check(found: Correspondence, size: Size) -> Float32:
+    """Confidence [h, w] of the matches that come back to where they started, for images of ``size``."""
     height, width = found.confidence.shape
     off = found.back - pixel_grid((height, width)) * np.array([size.width / width, size.height / height], np.float32)
     squares = off[..., 0] ** 2 + off[..., 1] ** 2
     good = (squares < (_CROSS * size.unit) ** 2) & (found.confidence >= _LEAST_CONFIDENCE)
     good &= np.isfinite(found.target[..., 0])
-    return np.where(good, found.confidence, np.float32(0)), squares < (_EXACT * size.unit) ** 2
+    return np.where(good, found.confidence, np.float32(0))
 
 
 def geometric_check(theta: Float64, T: Float64, x: np.ndarray, target: np.ndarray, width: int) -> np.ndarray:

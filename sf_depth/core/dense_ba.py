@@ -153,7 +153,7 @@ def optimum(
     here, damping, done = replace(start, stretch=start.drawn if stretch and poses else None), 1e-3, 0
     squares = squared_residuals(seen, here)
     while done < iterations:
-        sigma = _deviation(squares)
+        sigma = deviation(squares)
         cost = _cost(squares, seen, here, sigma)
         columns = pinhole.free_columns(here.theta, intrinsics)
         system = linearise(seen, here, sigma, poses, columns)
@@ -175,7 +175,7 @@ def optimum(
         here, squares = better, squares_there
         if fall < _FALL:
             break
-    sigma = _deviation(squares)
+    sigma = deviation(squares)
     return Optimum(here, done, sigma, _cost(squares, seen, here, sigma))
 
 
@@ -190,7 +190,7 @@ def squared_residuals(seen: Observations, at: Estimate) -> Float32:
     return np.asarray(kernels("sf_depth").squared_residuals(*_arrays(seen, at)))
 
 
-def _deviation(squares: Float32) -> float:
+def deviation(squares: Float32) -> float:
     """Robust standard deviation of one coordinate, px: the median of a Rayleigh distribution is 1.177 sigma."""
     known = squares[~np.isnan(squares)]
     return max(float(np.median(np.sqrt(known))) / 1.177 if len(known) else 1.0, _LEAST_SIGMA)

@@ -15,7 +15,7 @@ from sf_interfaces.types import Float32
 
 @dataclass(frozen=True, slots=True)
 class Matched:
-    """Cross-checked correspondences: target [S, H, W, 2] px and weight [S, H, W]; ``seen`` is every n-th of the exact.
+    """Cross-checked correspondences: target [S, H, W, 2] px and weight [S, H, W]; ``seen`` is every n-th of them.
 
     A coarse match has half the rows and columns; its pixels are those of the full images.
     """
@@ -26,17 +26,16 @@ class Matched:
     grid: tuple[int, int]  # rows and columns of ``seen``
 
 
-def matched(target: Float32, weight: Float32, exact: np.ndarray, stride: int, size: Size) -> Matched:
-    """Correspondences with every n-th pixel of both axes as observations, of those that are ``exact`` [S, H, W]."""
+def matched(target: Float32, weight: Float32, stride: int, size: Size) -> Matched:
+    """Correspondences with every n-th pixel of both axes as observations."""
     every = (slice(stride // 2, None, stride),) * 2
     count, height, width = weight.shape
     uv = pixel_grid((height, width))[every] * np.array([size.width / width, size.height / height], np.float32)
     columns = target[:, every[0], every[1]].reshape(count, -1, 2).transpose(0, 2, 1).astype(np.float64)
-    sure = np.where(exact[:, every[0], every[1]], weight[:, every[0], every[1]], np.float32(0))
     seen = Observations(
         np.ascontiguousarray(uv.reshape(-1, 2).T, dtype=np.float64),
         np.ascontiguousarray(columns),
-        sure.reshape(count, -1).astype(np.float64),
+        weight[:, every[0], every[1]].reshape(count, -1).astype(np.float64),
     )
     return Matched(target, weight, seen, uv.shape[:2])
 

@@ -162,12 +162,11 @@ def grey(image: UInt8) -> UInt8:
 def flow(first: UInt8, second: UInt8, fine: bool = False) -> Float32:
     """Displacement [H, W, 2] px from the first image to the second; ``fine``: down to the full resolution."""
     search = cv2.DISOpticalFlow_create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    if fine:  # the preset ends at half of it; fewer steps a patch suffice there, and small ones straddle fewer edges
+    if fine:  # the preset ends at half of it; fewer steps a patch suffice there
         search.setFinestScale(0)
-        search.setPatchSize(6)
-        search.setPatchStride(4)
+        search.setPatchStride(5)
         search.setGradientDescentIterations(8)
-        search.setVariationalRefinementIterations(0)
+        search.setVariationalRefinementIterations(2)
     return np.asarray(search.calc(first, second, None), dtype=np.float32)
 
 

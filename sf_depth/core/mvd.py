@@ -158,15 +158,15 @@ class MultiViewDepth:
         """Correspondences to every source that come back to where they started."""
         size = Size(reference.shape[1], reference.shape[0])
 
-        def one(j: int) -> tuple[Float32, Float32, np.ndarray]:
+        def one(j: int) -> tuple[Float32, Float32]:
             expected = None if guess is None else guess[j]
             found = self._matcher(reference, sources[j], expected, coarse=coarse)
-            weight, exact = checks.cross_check(found, size)
-            return np.where(weight[..., None] > 0, found.target, np.float32(0)), weight, exact
+            weight = checks.cross_check(found, size)
+            return np.where(weight[..., None] > 0, found.target, np.float32(0)), weight
 
         found = each(one, range(len(sources)))
-        target, weight, exact = (np.stack(part) for part in zip(*found, strict=True))
-        return matched(target, weight, exact, self._config.stride, size)
+        target, weight = (np.stack(part) for part in zip(*found, strict=True))
+        return matched(target, weight, self._config.stride, size)
 
     def _check_and_adjust(
         self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str, stretch: bool = False
@@ -192,7 +192,7 @@ class MultiViewDepth:
         """The fit with a radial term where the images show a lens, otherwise as it was.
 
         Beside an unknown focal length only where the views tell both; as the two make up for each other, what the
-        lens moves the focal length by counts as unsure in it.
+        lens moves the focal length by counts as unsure in it, in the share of the cost that it leaves.
         """
         bent = _BENT.get(free) if self._lens else None
         if bent is None:
@@ -208,15 +208,15 @@ class MultiViewDepth:
                 return fit
         at = replace(found.estimate, inverse_depth=fit.adjusted.estimate.inverse_depth)
         lens = self._check_and_adjust(seen, at, size, True, bent, True)
-        moved = np.log(lens.adjusted.estimate.theta[0] / fit.adjusted.estimate.theta[0])
+        moved = np.log(lens.adjusted.estimate.theta[0] / fit.adjusted.estimate.theta[0]) * found.cost / straight.cost
         return replace(lens, focal_deviation=float(np.hypot(lens.unsure, moved)))
 
     def _with_usual_focal(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
         """The fit with the focal length of usual cameras as far as the views do not tell it."""
-        if free == "none" or fit.unsure < focal.UNSURE:
+        if free == "none" or (told := dense_depth.focal_deviation(fit.adjusted)) < focal.UNSURE:
             return fit
         at = fit.adjusted.estimate
-        f, deviation = focal.drawn(at.theta[0], fit.unsure, max(size.width, size.height))
+        f, deviation = focal.drawn(at.theta[0], told, max(size.width, size.height))
         theta = at.theta * [f / at.theta[0], f / at.theta[0], 1, 1, 1]
         fit = self._check_and_adjust(seen, replace(at, theta=theta), size, True, "none", True)
         return replace(fit, focal_deviation=deviation, usual=True)
@@ -277,7 +277,8 @@ def _triangulated(seen: Observations, theta: Float64, T: Float64) -> Estimate:
 
 def _dense(pairs: Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
     """Inverse depth [H, W] of every pixel whose correspondences pass the checks."""
-    at, sigma = fit.adjusted.estimate, fit.adjusted.sigma
+    at = replace(fit.adjusted.estimate, stretch=None)  # what errors have in common is in all depths
+    sigma = dense_ba.deviation(dense_ba.squared_residuals(fit.seen, at))
     grid = pixel_grid((size.height, size.width)).reshape(-1, 2)
     weight, target = pairs.weight.reshape(len(at.T), -1), pairs.target.reshape(len(at.T), -1, 2)
 
