@@ -34,6 +34,7 @@ _LEAST_KEPT = 0.3  # share of the correspondences that given poses have to expla
 _BENT = {"none": "lens", "f": "radial"}  # what is free with a radial term
 _LENS = 0.01  # share of the cost that a radial term has to explain; 0.003 is the most where there is no lens
 _SURE = 0.01  # deviation of an unknown focal length; less sure, it and the radial term make up for each other
+_SHARED = 0.12  # share of the cost that stretches have to explain; on simulated images it is 0.005 at most
 _LENS_THINNING = 3  # every n-th of the pixels of dense BA tells whether there is a lens
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
 _BLOCK = 1 << 15  # pixels solved at once: their arrays stay in the cache
@@ -184,8 +185,11 @@ class MultiViewDepth:
                     "scene; give views that are a tenth of the distance to the scene apart"
                 )
             good = Observations(seen.uv, seen.target, weight)
-            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, stretch=stretch and last)
+            found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
             at = found.estimate
+            if stretch and last:
+                drawn = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, stretch=True)
+                found = drawn if drawn.cost < (1.0 - _SHARED) * found.cost else found
         return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
 
     def _with_lens(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
@@ -198,8 +202,9 @@ class MultiViewDepth:
         if bent is None:
             return fit
         few, at = thinned(fit.seen, fit.adjusted.estimate, _LENS_THINNING)
-        straight = dense_ba.optimum(few, at, intrinsics=free, stretch=True)
-        found = dense_ba.optimum(few, straight.estimate, intrinsics=bent, stretch=True)
+        drawn = at.stretch is not None
+        straight = dense_ba.optimum(few, at, intrinsics=free, stretch=drawn)
+        found = dense_ba.optimum(few, straight.estimate, intrinsics=bent, stretch=drawn)
         if found.cost > (1.0 - _LENS) * straight.cost:
             return fit
         if free == "f":
