@@ -47,7 +47,9 @@ class ReconConfig:
     )
     memory_mb: float = option(0.0, "budget for points and keyframe images, MB; 0: none", low=0.0)
     mesh: str = option("tsdf", "mesh.ply at the end of a run: none, tsdf or poisson")
-    mesh_voxel: float = option(1.0, "voxel of the mesh, in resolutions", low=0.5, high=16.0)
+    mesh_voxel: float = option(
+        0.0, "voxel of the mesh, in resolutions; 0: one, or two where the map is large", low=0.0, high=16.0
+    )
     live_turns: int = option(200, "live: training iterations of a keyframe after which it rests", low=1)
     view_port: int = option(0, "live: port of the viewer's page on this machine; 0: none", low=0, high=65535)
     psnr_goal: float = option(25.0, "live: timing.json says how long a keyframe takes to reach this, dB", low=0.0)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 _TRUNCATION = 4.0  # of the signed distance, in voxels
 _BLOCK = 8  # voxels per side of a block
+_MOST_BLOCKS = 30000  # with points, which blocks of the finest voxels may be: they weigh about 1 GB
 _TRIM = 3.0  # a triangle farther than this from every drawn point is invented, in voxels
 _MAX_DEPTH = 10  # of the Poisson octree: 1024 cells per side
 _SMALLEST = 120  # triangles; a smaller piece is noise
@@ -86,7 +87,17 @@ def poisson(reconstruction: Reconstruction) -> Mesh:
 
 
 def _voxel(reconstruction: Reconstruction) -> float:
-    return reconstruction.config.mesh_voxel * reconstruction.resolution
+    """Side of a voxel, m."""
+    return (reconstruction.config.mesh_voxel or _automatic(reconstruction)) * reconstruction.resolution
+
+
+def _automatic(reconstruction: Reconstruction) -> float:
+    """Voxel in resolutions: half of them find more of the surface, and more truly, at eight times the memory."""
+    assert reconstruction.points is not None
+    block = _BLOCK * reconstruction.resolution
+    levels = (reconstruction.points.tops(i) for i in range(len(reconstruction.points.levels)))
+    taken = sum(len(np.unique(np.floor(points / block).astype(np.int64), axis=0)) for points in levels)
+    return 1.0 if taken <= _MOST_BLOCKS else 2.0
 
 
 def _drawn(reconstruction: Reconstruction) -> Iterator[tuple[Camera, Float64, Float32, UInt8]]:

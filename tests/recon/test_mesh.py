@@ -44,6 +44,13 @@ def test_products(room: Reconstruction, tmp_path: Path) -> None:
     assert np.median(agreement) > 0.98 and (agreement > 0).mean() > 0.99
 
 
+def test_a_large_map_gets_voxels_of_twice_the_resolution(room: Reconstruction, monkeypatch: pytest.MonkeyPatch) -> None:
+    fine = mesh.extract(room)
+    monkeypatch.setattr(mesh, "_MOST_BLOCKS", 10)
+    coarse = mesh.extract(room)
+    assert 3 * len(coarse.triangles) < len(fine.triangles)
+
+
 def test_unknown_mesh_is_an_error() -> None:
     with pytest.raises(ConfigError, match=r"none, tsdf, poisson"):
         Reconstruction(ReconConfig(mesh="marching"))
