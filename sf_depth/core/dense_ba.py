@@ -119,20 +119,6 @@ class System:
     scores: Float32
 
 
-def adjust(
-    seen: Observations,
-    start: Estimate,
-    *,
-    poses: bool = True,
-    intrinsics: str = "none",
-    stretch: bool = False,
-    iterations: int = 25,
-) -> Adjusted:
-    """:func:`optimum` with its covariance."""
-    found = optimum(seen, start, poses=poses, intrinsics=intrinsics, stretch=stretch, iterations=iterations)
-    return with_covariance(seen, found, poses, intrinsics)
-
-
 def optimum(
     seen: Observations,
     start: Estimate,

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from views import exact, rotation_error_deg
+from views import adjust, exact, rotation_error_deg
 
 from sf_depth.core import dense_ba, pinhole
 from sf_depth.core import dense_ba_reference as reference
@@ -34,7 +34,7 @@ def disturbed(truth: Estimate, focal: float = 1.0) -> Estimate:
 @pytest.mark.parametrize("free, k1", [("none", 0.0), ("f", 0.0), ("pinhole", 0.0), ("radial", -0.1)])
 def test_the_optimum_is_the_truth_within_the_noise(free: str, k1: float) -> None:
     seen, truth = exact(k1=k1)
-    found = dense_ba.adjust(seen, disturbed(truth, 1.0 if free == "none" else 0.8), intrinsics=free)
+    found = adjust(seen, disturbed(truth, 1.0 if free == "none" else 0.8), intrinsics=free)
     assert found.iterations <= 25
     assert rotation_error_deg(found.estimate.T, truth.T) < 0.05
     assert np.median(np.abs(relative_error(found.estimate, truth))) < 0.004
@@ -123,7 +123,7 @@ def test_deviations_hold_what_they_promise() -> None:
     inside, pulls = [], []
     for seed in range(12):
         seen, truth = exact(count=800, seed=seed)
-        found = dense_ba.adjust(seen, truth, intrinsics="f")
+        found = adjust(seen, truth, intrinsics="f")
         factor = np.linalg.norm(truth.T[:, :3, 3]) / np.linalg.norm(found.estimate.T[:, :3, 3])
         error = found.estimate.inverse_depth / factor - truth.inverse_depth
         inside.append(np.mean(np.abs(error) < np.sqrt(found.inverse_depth_variance)))
@@ -147,7 +147,7 @@ def test_errors_that_are_alike_all_over_an_image_hardly_move_the_cameras() -> No
     for seed in range(10):
         seen, truth = sheared(seed)
         for stretch in (False, True):
-            found = dense_ba.adjust(seen, truth, intrinsics="f", stretch=stretch)
+            found = adjust(seen, truth, intrinsics="f", stretch=stretch)
             error = np.log(found.estimate.theta[0] / truth.theta[0])
             off[stretch].append(abs(error))
             pulls[stretch].append(error / np.sqrt(found.covariance[24, 24]))
@@ -162,7 +162,7 @@ def test_wrong_correspondences_and_points_behind_do_not_matter() -> None:
     target = seen.target.copy()
     wrong = rng.random(target.shape[2]) < 0.2
     target[:, :, wrong] = rng.uniform(0, 480, target[:, :, wrong].shape)
-    found = dense_ba.adjust(replace(seen, target=target), disturbed(truth), intrinsics="none")
+    found = adjust(replace(seen, target=target), disturbed(truth), intrinsics="none")
     assert rotation_error_deg(found.estimate.T, truth.T) < 0.1
     assert np.median(np.abs(relative_error(found.estimate, truth)[~wrong])) < 0.01
     assert (found.estimate.inverse_depth > 0).all()
@@ -171,7 +171,7 @@ def test_wrong_correspondences_and_points_behind_do_not_matter() -> None:
 def test_given_poses_keep_the_scale() -> None:
     seen, truth = exact()
     at = replace(truth, inverse_depth=np.full_like(truth.inverse_depth, 0.4))
-    found = dense_ba.adjust(seen, at, poses=False)
+    found = adjust(seen, at, poses=False)
     np.testing.assert_array_equal(found.estimate.T, truth.T)
     assert np.median(np.abs(found.estimate.inverse_depth / truth.inverse_depth - 1)) < 0.004
 
@@ -179,7 +179,7 @@ def test_given_poses_keep_the_scale() -> None:
 @pytest.mark.parametrize("focal", [260.0, 520.0, 1040.0, 1500.0])
 def test_the_start_needs_no_guess_of_the_focal_length(focal: float) -> None:
     seen, truth = exact(focal=focal, noise=0.3)
-    found = dense_ba.adjust(seen, start(seen, SIZE, None), intrinsics="f")
+    found = adjust(seen, start(seen, SIZE, None), intrinsics="f")
     assert abs(found.estimate.theta[0] / focal - 1) < 0.01
     assert rotation_error_deg(found.estimate.T, truth.T) < 0.1
 

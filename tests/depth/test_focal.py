@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from views import exact
+from views import adjust, exact
 
-from sf_depth.core import dense_ba, dense_depth, focal
+from sf_depth.core import dense_depth, focal
 from sf_depth.core.dense_ba import Observations
 from sf_depth.core.start import Size, start
 from sf_interfaces.types import Float64
@@ -39,7 +39,7 @@ def test_the_focal_length_is_as_sure_as_it_is_said_to_be(size: float) -> None:
         target = np.nan_to_num(seen.target + smooth_errors(seen, rng, size), nan=-1.0)
         inside = ((target > 0) & (target < [[640.0], [480.0]])).all(axis=1)
         seen = Observations(seen.uv, target, inside.astype(float))
-        found = dense_ba.adjust(seen, start(seen, SIZE, None), intrinsics="f", stretch=True)
+        found = adjust(seen, start(seen, SIZE, None), intrinsics="f", stretch=True)
         pulls.append(np.log(found.estimate.theta[0] / true) / dense_depth.focal_deviation(found))
     assert (np.abs(pulls) < 1).mean() >= 0.5 and max(np.abs(pulls)) < 3
 
