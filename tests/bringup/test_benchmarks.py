@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -158,3 +159,20 @@ def test_sweeps_of_a_walk_are_brought_to_the_image_by_the_motion_tracked_so_far(
 
     right = off(1.0)
     assert right < 0.01 and right < 0.95 * min(off(0.0), off(2.0))
+
+
+def test_weights_of_lpips_are_read_without_running_code(tmp_path: Path) -> None:
+    import lpips_weights
+
+    kernel = np.arange(2 * 2 * 3 * 5, dtype=np.float32).reshape(2, 2, 3, 5)
+    layer = {"kernel": kernel, "bias": np.zeros(5, np.float32)}
+    layers: dict[str, object] = {"AlexNet_0": {f"Conv_{j}": layer for j in range(5)}}
+    layers |= {f"NetLinLayer_{j}": {"Conv_0": {"kernel": kernel[:1, :1]}} for j in range(5)}
+    file = tmp_path / "alexnet.ckpt"
+    file.write_bytes(pickle.dumps(layers, protocol=3))
+    alexnet, linear = lpips_weights.convert(file)
+    assert alexnet["features.3.weight"][4, 2, 1, 0] == kernel[1, 0, 2, 4] and len(alexnet) == 10
+    assert linear["lin4.model.1.weight"].shape == (5, 3, 1, 1)
+    file.write_bytes(pickle.dumps({"AlexNet_0": Path}))
+    with pytest.raises(pickle.UnpicklingError, match="arrays alone"):
+        lpips_weights.convert(file)
