@@ -28,7 +28,7 @@ KERNELS = ((11, 3, 64), (5, 64, 192), (3, 192, 384), (3, 384, 256), (3, 256, 256
 
 def outputs_first(kernel: np.ndarray) -> Tensor:
     """[out, in, h, w] from [h, w, in, out]."""
-    return torch.from_numpy(np.ascontiguousarray(kernel.transpose(3, 2, 0, 1)))
+    return torch.from_numpy(kernel.transpose(3, 2, 0, 1).copy())
 
 
 def convert(pickled: bytes) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
