@@ -82,6 +82,7 @@ def _filled(image: np.ndarray, seen: DepthMap) -> tuple[Float32, Float32]:
     )
     low, high = np.quantile(d[support], [0.01, 0.99])
     along, level = (np.clip(part, low / _FARTHEST, high * _FARTHEST) for part in (along, level))
+    known = np.clip(known, relative[support].min(), relative[support].max())  # a mean, which few steps may miss
     away = cv2.distanceTransform((~support).astype(np.uint8), cv2.DIST_L2, 3) / width
     unsure = _BOUNDS * np.maximum(square / level**2 - 1.0, 0.0) + _PLANES * np.log(along / level) ** 2
     unsure += _SEEN * known + (_AWAY * away) ** 2

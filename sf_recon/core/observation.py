@@ -85,7 +85,7 @@ def observe(keyframe: Keyframe, config: ReconConfig) -> Observation:
         z, variance = depth.z.reshape(-1), depth.variance.reshape(-1)
         largest = (config.max_relative_sigma * np.where(usable, z, 1)) ** 2
         with np.errstate(invalid="ignore"):
-            usable = usable & (variance <= largest)
+            usable = usable & (variance >= 0) & (variance <= largest)
         known = np.where(usable, variance, largest)
         weights = (largest / np.maximum(known, _SIGMA_FLOOR**2 * largest)).astype(np.float32)
     pixels = np.flatnonzero(usable)

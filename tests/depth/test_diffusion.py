@@ -106,6 +106,21 @@ def test_gaps_at_the_edges_of_a_room_are_as_sure_as_they_are_right() -> None:
     np.testing.assert_array_equal(again.variance, depth.variance)
 
 
+def test_no_variance_is_negative_where_few_steps_do_not_arrive() -> None:
+    rng, (height, width) = np.random.default_rng(1), (188, 620)
+    image = rng.integers(0, 3, (height, width, 3)).astype(np.uint8)
+    image[:, ::9] = 250  # bars that heat hardly passes
+    keep = np.zeros((height, width), bool)
+    keep[height // 2 :] = rng.random((height - height // 2, width)) < 0.9
+    keep[:, 200:260] = False
+    z = np.where(keep, rng.uniform(1, 9, keep.shape), np.nan).astype(np.float32)
+    variance = (z * z * 10 ** rng.uniform(-10, 0, z.shape)).astype(np.float32)
+    camera = Camera(width, height, 500.0, 500.0, width / 2, height / 2)
+    full = Filler(DepthConfig()).fill(Keyframe(1, camera, image, np.eye(4), DepthMap(z, variance))).depth
+    assert full is not None and full.variance is not None
+    assert (full.variance > 0).all() and np.isfinite(full.z).all()
+
+
 def test_four_pixels_beside_each_other_are_enough() -> None:
     z = np.full((120, 160), np.nan)
     z[60:62, 80:82] = 2.0

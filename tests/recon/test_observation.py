@@ -32,6 +32,10 @@ def test_stated_variance_and_sparse_depth_are_taken_as_they_are() -> None:
     z[40, 50] *= 0.1
     sure = DepthMap(z, np.full_like(z, 1e-6))
     assert len(observe(replace(key, depth=sure), ReconConfig()).pixels) == z.size
+    impossible = np.full_like(z, 1e-6)
+    impossible[3, 4], impossible[5, 6] = -1e-6, np.nan
+    seen = observe(replace(key, depth=DepthMap(z, impossible)), ReconConfig())
+    assert len(seen.pixels) == z.size - 2 and np.isfinite(seen.sigmas).all()
     sparse = np.full_like(z, np.nan)
     sparse[::5, ::5] = z[::5, ::5]
     assert len(observe(replace(key, depth=DepthMap(sparse)), ReconConfig()).pixels) == np.isfinite(sparse).sum()
