@@ -84,8 +84,10 @@ class CudaRasterizer:
         return Raster(**{name: image.cpu().numpy() for name, image in images.items()})
 
     def _sent(self, points: Float32) -> Tensor:
-        for known, tensor in self._clouds:
+        for i, (known, tensor) in enumerate(self._clouds):
             if known is points:
+                del self._clouds[i]  # what is drawn again and again outlasts what is made for one view
+                self._clouds.append((points, tensor))
                 return tensor
         tensor = torch.from_numpy(np.ascontiguousarray(points, dtype=np.float32)).to(self._device)
         self._clouds.append((points, tensor))
