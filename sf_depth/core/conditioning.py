@@ -65,12 +65,10 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
             continue
         if len(index) < 2:
             index = everywhere
-        tree = cKDTree(index)
-        count = min(_NEIGHBOURS, len(index) - 1)
-        distance, near = tree.query(index, k=count + 1, workers=-1)
+        tree, near, spacing = _neighbours(index)
         first.append(sum(map(len, indices)))
-        spacings.append(distance[:, min(6, count)])
-        nears.append(np.pad(near[:, 1:], ((0, 0), (0, _NEIGHBOURS - count)), mode="edge") + first[-1])
+        spacings.append(spacing)
+        nears.append(np.pad(near, ((0, 0), (0, _NEIGHBOURS - near.shape[1])), mode="edge") + first[-1])
         indices.append(index)
         trees.append(tree)
     index = np.concatenate(indices)
@@ -78,11 +76,17 @@ def observe(ratio: Float32, noise: Float32, measured: np.ndarray) -> Observation
     x = torch.from_numpy(index[:, ::-1].astype(np.float32))
     near = torch.from_numpy(np.concatenate(nears))
     value = torch.from_numpy(np.ascontiguousarray(ratio[row, col]))
-    spacing = torch.from_numpy(np.concatenate(spacings).astype(np.float32))
+    apart = torch.from_numpy(np.concatenate(spacings))
     variance = torch.from_numpy(np.ascontiguousarray(noise[row, col]))
-    parts = torch.arange(len(x)).split(_CHUNK)
-    slope = torch.cat(each(lambda part: _slopes(x, value, near, spacing, part), parts))
-    return Observations(index, x, value, variance, slope, spacing, near, tuple(trees), tuple(first))
+    slope = _slopes(x, value, near, apart)
+    return Observations(index, x, value, variance, slope, apart, near, tuple(trees), tuple(first))
+
+
+def _neighbours(index: np.ndarray) -> tuple[cKDTree, np.ndarray, Float32]:
+    """Of pixels [N, 2] their tree, which others are nearest to each [N, M], and how far apart these lie [N] px."""
+    tree, count = cKDTree(index), min(_NEIGHBOURS, len(index) - 1)
+    distance, near = tree.query(index, k=count + 1, workers=-1)
+    return tree, near[:, 1:], distance[:, min(6, count)].astype(np.float32)
 
 
 def _thinned(measured: np.ndarray, cell: int) -> np.ndarray:
@@ -99,7 +103,13 @@ def _thinned(measured: np.ndarray, cell: int) -> np.ndarray:
     return np.stack([row[order], col[order]], axis=1)
 
 
-def _slopes(
+def _slopes(x: torch.Tensor, ratio: torch.Tensor, near: torch.Tensor, spacing: torch.Tensor) -> torch.Tensor:
+    """Slopes of robust planes through all observations, [N, 2]."""
+    parts = torch.arange(len(x)).split(_CHUNK)
+    return torch.cat(each(lambda part: _slopes_at(x, ratio, near, spacing, part), parts))
+
+
+def _slopes_at(
     x: torch.Tensor, ratio: torch.Tensor, near: torch.Tensor, spacing: torch.Tensor, part: torch.Tensor
 ) -> torch.Tensor:
     """Robust plane through some observations, [B, 2]: other surfaces among their neighbours are left out."""
@@ -124,15 +134,11 @@ def _slopes(
 def coarse_slopes(ratio: Float32, measured: np.ndarray, cell: int) -> tuple[np.ndarray, Float32]:
     """Slopes of ratio [H, W] at one measured pixel a cell: (row, col) [N, 2] and ratio per px [N, 2] (right, down)."""
     index = _thinned(measured, cell)
-    count = min(_NEIGHBOURS, len(index) - 1)
-    if count < 1:
+    if len(index) < 2:
         return index, np.zeros((len(index), 2), np.float32)
-    distance, near = cKDTree(index).query(index, k=count + 1, workers=-1)
+    _, near, spacing = _neighbours(index)
     x, value = torch.from_numpy(index[:, ::-1].astype(np.float32)), torch.from_numpy(ratio[tuple(index.T)])
-    spacing = torch.from_numpy(distance[:, min(6, count)].astype(np.float32))
-    parts = torch.arange(len(x)).split(_CHUNK)
-    nearest = torch.from_numpy(near[:, 1:])
-    return index, torch.cat(each(lambda part: _slopes(x, value, nearest, spacing, part), parts)).numpy()
+    return index, _slopes(x, value, torch.from_numpy(near), torch.from_numpy(spacing)).numpy()
 
 
 def choose(observed: Observations, center: Float64, count: int, excluded: Float64 | None = None) -> torch.Tensor:
