@@ -20,6 +20,7 @@ from sf_bringup.simulate.ames import EYE
 from sf_bringup.simulate.render import Renderer
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.registration import register_depth
+from sf_interfaces.geometry.undistort import undistort_depth, undistort_image
 from sf_interfaces.io.datasets.indoor import SevenScenes
 from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
 
@@ -141,13 +142,15 @@ def real(data: Path, everything: bool = True) -> Iterator[ImageSet]:
 def seven_scenes(folder: Path, sets: tuple[tuple[int, ...], ...]) -> Iterator[ImageSet]:
     """A hand-held Kinect; its depth is registered to colour, its poses are good to a degree or two."""
     for frames in sets:
-        images = [_rgb(folder / f"frame-{k:06d}.color.jpg") for k in frames]
+        camera, lens = SevenScenes.COLOR_CAMERA, SevenScenes.LENS
+        images = [undistort_image(_rgb(folder / f"frame-{k:06d}.color.jpg"), camera, lens) for k in frames]
         motions = [_depth_to_color(folder, k) for k in frames]
         poses = [_pose(folder, k) @ se3.inverse(T) for k, T in motions]
         raw = cv2.imread(f"{folder}/frame-{motions[0][0]:06d}.depth.png", cv2.IMREAD_UNCHANGED)
         measured = DepthMap(np.where((raw == 0) | (raw == 65535), np.nan, raw * 1e-3))
-        truth = register_depth(measured, SevenScenes.DEPTH_CAMERA, SevenScenes.COLOR_CAMERA, motions[0][1])
-        yield ImageSet(f"7-Scenes {frames[0]}, {len(frames)} views", SevenScenes.COLOR_CAMERA, images, poses, truth)
+        truth = register_depth(measured, SevenScenes.DEPTH_CAMERA, camera, motions[0][1])
+        truth = undistort_depth(truth, camera, lens)
+        yield ImageSet(f"7-Scenes {frames[0]}, {len(frames)} views", camera, images, poses, truth)
 
 
 def _depth_to_color(folder: Path, frame: int) -> tuple[int, Float64]:

@@ -19,6 +19,7 @@ import numpy as np
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.registration import register_depth
+from sf_interfaces.geometry.undistort import Distortion
 from sf_interfaces.io.datasets.dataset import OPTICAL, START_NS, Dataset, Reader, Sample
 from sf_interfaces.io.datasets.files import (
     first_existing,
@@ -54,6 +55,8 @@ class SevenScenes(Dataset):
 
     DEPTH_CAMERA: ClassVar[Camera] = Camera(640, 480, 585.0, 585.0, 320.5, 240.5, OPTICAL)
     COLOR_CAMERA: ClassVar[Camera] = Camera(640, 480, 525.0, 525.0, 320.5, 240.5, OPTICAL)
+    # Of both cameras alike, so that depth is registered by pinholes and shares the lens of the image.
+    LENS: ClassVar[Distortion] = Distortion("plumb_bob", (-0.035, 0.0, 0.0, 0.0))
     T_COLOR_DEPTH: ClassVar[Float64] = se3.orthonormalise(
         np.array(
             [
@@ -93,7 +96,8 @@ class SevenScenes(Dataset):
         if self.register:
             depth = register_depth(depth, self.DEPTH_CAMERA, camera, self.T_COLOR_DEPTH)
             T = T @ se3.inverse(self.T_COLOR_DEPTH)
-        return Sample(stamp_30hz(number_of(file)), file, read_rgb(file), camera, depth=depth, pose=T)
+        lens = self.LENS if self.register else None
+        return Sample(stamp_30hz(number_of(file)), file, read_rgb(file), camera, lens, depth=depth, pose=T)
 
     def notes(self) -> Sequence[str]:
         return ("depth is registered to the colour camera (f 525); times are nominal, 30 Hz",)
