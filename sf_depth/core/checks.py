@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from sf_depth.core import pinhole
-from sf_depth.core.dense_ba import Estimate
+from sf_depth.core.dense_ba import Estimate, steadied
 from sf_depth.core.matching import Correspondence, pixel_grid
 from sf_depth.core.start import Size
 from sf_interfaces.geometry import se3
@@ -70,6 +70,6 @@ def checked(weight: np.ndarray, uv: np.ndarray, target: np.ndarray, at: Estimate
     Args:
         uv: reference pixels [2, N]; target: source pixels [S, 2, N], anything finite where the weight is 0.
     """
-    x = pinhole.rays(at.theta, uv)
+    x, target = pinhole.rays(at.theta, uv), steadied(at, target)
     good = [geometric_check(at.theta, T, x, target[j], width) for j, T in enumerate(at.T)]
     return np.where(good, weight, np.zeros((), weight.dtype))

@@ -6,10 +6,9 @@ Levenberg-Marquardt with a Cauchy kernel. The inverse depths are eliminated by t
 ``C dd + E^T dx = w`` the depth step is ``dd = C^-1 (w - E^T dx)``, where x holds poses and intrinsics alike.
 The sums over all correspondences are compiled; ``dense_ba_reference`` says what they are.
 
-The errors of correspondences are not independent: what a source gets wrong it gets wrong all over its image, and free
-poses would explain that by a motion. Each source may therefore be drawn by a small symmetric stretch ``(1 + s, t; t,
-1 - s)`` of its image, which no motion and no zoom makes, with a prior that keeps it small. It is a part of the errors,
-marginalised like the inverse depths, and belongs to no result.
+A camera that moves while the rows of its image are read one after the other (rolling shutter) sees every row from a
+pose of its own, and free poses would explain that by another motion. Each source may therefore turn while it is read: a
+row at tangent y is seen after a further rotation ``exp(y omega)``; a hand turns little in so short a time.
 """
 
 # SPDX-License-Identifier: Apache-2.0
@@ -29,7 +28,9 @@ KERNEL = 2.5  # deviations at which the Cauchy kernel sets in
 _LEAST_SIGMA = 0.02  # px; correspondences are never better than this
 _FALL = 1e-4  # relative fall of the cost below which the iteration has converged
 _TILES = (9, 12)  # rows and columns of the tiles that count as independent in the covariance
-_STRETCH = 0.02  # what the prior of a stretch weighs: so much of the px^2 by which it moves a pixel at tangent 1
+_BEND = 0.04  # prior deviation of a radial term beside known intrinsics: of lenses that pass for none
+_ALIKE = 30  # correspondences of a source that err on their own, for these priors: neighbours err alike
+_LEAST_OWN = 0.1  # share that correspondences have in what is known of a turn, at least
 _LEAST_TOLD = 1e-9  # of the surest combination of parameters; sums in single precision tell no less
 _LARGEST_STEP = 4.0  # factor by which one step may change an inverse depth
 
@@ -57,18 +58,22 @@ class Estimate:
         theta: intrinsics [5], see :mod:`sf_depth.core.pinhole`.
         T: T_source_reference [S, 4, 4].
         inverse_depth: [N], 1 / unit of the translations, positive.
-        stretch: (s, t) of every source [S, 2]; None: none is drawn.
+        turn: rotation vector of every source while its rows are read, rad per unit of the row's tangent [S, 3];
+            None: none turns.
+        turn_deviation, bend_deviation: of the priors of each turn, in the same unit, and of the radial term.
     """
 
     theta: Float64
     T: Float64
     inverse_depth: Float64
-    stretch: Float64 | None = None
+    turn: Float64 | None = None
+    turn_deviation: float = np.inf
+    bend_deviation: float = np.inf
 
     @property
-    def drawn(self) -> Float64:
-        """The stretches of all sources [S, 2]."""
-        return np.zeros((len(self.T), 2)) if self.stretch is None else self.stretch
+    def turned(self) -> Float64:
+        """The turns of all sources [S, 3]."""
+        return np.zeros((len(self.T), 3)) if self.turn is None else self.turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +111,7 @@ class Adjusted(Optimum):
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Normal equations: H [P, P] and g [P] of poses, stretches, intrinsics; C [N] and w [N] of depths; E [P, N] both.
+    """Normal equations: H [P, P] and g [P] of poses, turns, intrinsics; C [N] and w [N] of depths; E [P, N] both.
 
     ``scores`` is what each pixel contributes to g, [P, N], where it was asked for.
     """
@@ -125,18 +130,23 @@ def optimum(
     *,
     poses: bool = True,
     intrinsics: str = "none",
-    stretch: bool = False,
+    turn: float = 0.0,
     iterations: int = 25,
 ) -> Optimum:
     """Minimise the reprojection error over the inverse depths and whatever is free.
 
     Args:
         poses: whether the poses of the sources are free; fixed ones also fix the scale.
-        intrinsics: which are free: none, f, pinhole (fx fy cx cy), radial (f and one radial term).
-        stretch: whether the images of the sources may be drawn; only with free poses.
+        intrinsics: which are free: none, f, pinhole (fx fy cx cy), radial (f and one radial term), or lens (that term
+            alone, which is kept small).
+        turn: prior deviation of what sources turn by while they are read, rad per unit of the row's tangent; 0: they
+            do not turn. Only with free poses.
         iterations: at most.
     """
-    here, damping, done = replace(start, stretch=start.drawn if stretch and poses else None), 1e-3, 0
+    turns = start.turned if turn and poses else None
+    bend = _BEND if intrinsics == "lens" else np.inf
+    here = replace(start, turn=turns, turn_deviation=turn or np.inf, bend_deviation=bend)
+    damping, done = 1e-3, 0
     squares = squared_residuals(seen, here)
     while done < iterations:
         sigma = deviation(squares)
@@ -166,8 +176,8 @@ def optimum(
 
 
 def _arrays(seen: Observations, at: Estimate) -> tuple[Float64, ...]:
-    """What the kernels take: theta, T, rays, inverse depth, target, weight, stretch."""
-    arrays = (at.theta, at.T, pinhole.rays(at.theta, seen.uv), at.inverse_depth, seen.target, seen.weight, at.drawn)
+    """What the kernels take: theta, T, rays, inverse depth, target, weight, turn."""
+    arrays = (at.theta, at.T, pinhole.rays(at.theta, seen.uv), at.inverse_depth, seen.target, seen.weight, at.turned)
     return tuple(np.ascontiguousarray(array, np.float64) for array in arrays)
 
 
@@ -188,18 +198,22 @@ def robust_cost(squares: Float32, weight: Float64, sigma: float) -> float:
     return float(total / max(weights, 1e-12))
 
 
-def stretch_information(seen: Observations, at: Estimate) -> Float64:
-    """Of the prior of each source's stretch, [S]: in proportion to its correspondences, whose errors are alike."""
-    return np.asarray(_STRETCH * at.theta[0] ** 2 * seen.weight.sum(axis=1))
+def turn_information(seen: Observations, at: Estimate, sigma: float) -> Float64:
+    """Of the prior of each source's turn, [S] px^2: as many of its correspondences as err on their own outweigh it."""
+    return np.asarray((sigma / at.turn_deviation) ** 2 / _ALIKE * seen.weight.sum(axis=1))
+
+
+def bend_information(seen: Observations, at: Estimate, sigma: float) -> float:
+    """The same of the radial term, px^2."""
+    return float((sigma / at.bend_deviation) ** 2 / _ALIKE * seen.weight.sum())
 
 
 def _cost(squares: Float32, seen: Observations, at: Estimate, sigma: float) -> float:
-    """:func:`robust_cost` with that of the stretches."""
-    cost = robust_cost(squares, seen.weight, sigma)
-    if at.stretch is None:
-        return cost
-    drawn = stretch_information(seen, at) @ (at.stretch**2).sum(axis=1)
-    return float(cost + drawn / max(seen.weight.sum(), 1e-12))
+    """:func:`robust_cost` with that of the priors."""
+    prior = bend_information(seen, at, sigma) * at.theta[4] ** 2
+    if at.turn is not None:
+        prior += turn_information(seen, at, sigma) @ (at.turn**2).sum(axis=1)
+    return float(robust_cost(squares, seen.weight, sigma) + prior / max(seen.weight.sum(), 1e-12))
 
 
 def linearise(
@@ -207,24 +221,41 @@ def linearise(
 ) -> System:
     """Normal equations at an estimate with the Cauchy weights of a deviation ``sigma`` px.
 
-    The stretches of the sources are free where the estimate has some.
+    The turns of the sources are free where the estimate has some.
     """
     x = pinhole.rays(at.theta, seen.uv).astype(np.float32)
     dx = pinhole.rays_jacobian(at.theta, x, columns) if columns.shape[1] else np.zeros((2, 0, 0), np.float32)
     arrays = (*_arrays(seen, at), np.ascontiguousarray(dx), np.ascontiguousarray(columns))
-    drawn = at.stretch is not None
-    system = System(*kernels("sf_depth").linearise(*arrays, poses, drawn, (KERNEL * sigma) ** 2, scores))
-    if at.stretch is not None:
-        where = _stretches(len(at.T), poses)
-        information = np.repeat(stretch_information(seen, at), 2)
+    turns = at.turn is not None
+    system = System(*kernels("sf_depth").linearise(*arrays, poses, turns, (KERNEL * sigma) ** 2, scores))
+    if at.turn is not None:
+        where = _turns(len(at.T), poses)
+        information = np.repeat(turn_information(seen, at, sigma), 3)
         system.H[where, where] += information
-        system.g[where] -= information * at.stretch.ravel()
+        system.g[where] -= information * at.turn.ravel()
+    bent = len(system.g) - columns.shape[1] + np.flatnonzero(columns[4])
+    system.H[bent, bent] += bend_information(seen, at, sigma)
+    system.g[bent] -= bend_information(seen, at, sigma) * at.theta[4]
     return system
 
 
-def _stretches(count: int, poses: bool) -> np.ndarray:
-    """Rows of the stretches of so many sources among all: behind their poses."""
-    return (6 * count if poses else 0) + np.arange(2 * count)
+def _turns(count: int, poses: bool) -> np.ndarray:
+    """Rows of the turns of so many sources among all: behind their poses."""
+    return (6 * count if poses else 0) + np.arange(3 * count)
+
+
+def steadied(at: Estimate, target: np.ndarray) -> np.ndarray:
+    """Source pixels [S, 2, N] as sources that do not turn would have seen them, in their precision."""
+    if at.turn is None:
+        return target
+    out = np.empty_like(target)
+    for j, omega in enumerate(at.turn.astype(target.dtype)):
+        y = pinhole.rays(at.theta, target[j])
+        row = (target[j, 1] - target.dtype.type(at.theta[3])) / target.dtype.type(at.theta[1])
+        X = np.stack([y[0], y[1], np.ones_like(row)])
+        X -= row * np.cross(omega, X, axisb=0).T
+        out[j] = pinhole.project(at.theta, X[:2] / X[2])
+    return out
 
 
 def step(system: System, damping: float) -> tuple[Float64, Float64]:
@@ -246,15 +277,15 @@ def moved(at: Estimate, step: tuple[Float64, Float64], poses: bool, columns: Flo
     dx, dd = step
     count = len(at.T)
     T = se3.exp(dx[: 6 * count].reshape(count, 6)) @ at.T if poses else at.T
-    drawn = None if at.stretch is None else at.stretch + dx[_stretches(count, poses)].reshape(count, 2)
+    turn = None if at.turn is None else at.turn + dx[_turns(count, poses)].reshape(count, 3)
     theta = pinhole.moved(at.theta, columns, dx[len(dx) - columns.shape[1] :]) if columns.shape[1] else at.theta
     d = np.clip(at.inverse_depth + dd, at.inverse_depth / _LARGEST_STEP, at.inverse_depth * _LARGEST_STEP)
-    return Estimate(theta, T, d, drawn)
+    return replace(at, theta=theta, T=T, inverse_depth=d, turn=turn)
 
 
 def with_covariance(seen: Observations, found: Optimum, poses: bool, intrinsics: str) -> Adjusted:
     """Posterior covariance at the optimum. The scale, which nothing observes, counts as known."""
-    at, sigma = found.estimate, found.sigma
+    at, sigma = replace(found.estimate, bend_deviation=np.inf), found.sigma  # what the images say of a lens
     columns = pinhole.free_columns(at.theta, "pinhole" if intrinsics == "pinhole" else "radial")
     system = linearise(seen, at, sigma, poses, columns, scores=True)
     C = system.C + least_information(system.C)
@@ -265,23 +296,26 @@ def with_covariance(seen: Observations, found: Optimum, poses: bool, intrinsics:
         for j, T in enumerate(at.T):
             gauge[6 * j : 6 * j + 3] = T[:3, 3]
         S += np.trace(S) * np.outer(gauge, gauge) / max(gauge @ gauge, 1e-300)
-    scores = system.scores - scaled * system.w  # of poses, stretches and intrinsics alone, [P, N]
+    scores = system.scores - scaled * system.w  # of poses, turns and intrinsics alone, [P, N]
     inverse = _inverse(S)
     covariance = inverse @ _spread(seen.uv, scores, left) @ inverse + sigma**2 * inverse
-    if at.stretch is not None:
-        shift = _without(S, _stretches(len(at.T), poses), at.stretch.ravel())
+    if at.turn is not None:
+        where = _turns(len(at.T), poses)
+        told = np.diag(S)[where]
+        pulled = np.repeat(turn_information(seen, at, sigma), 3)  # what the prior has kept small counts whole
+        shift = _without(S, where, at.turn.ravel() * told / np.maximum(told - pulled, _LEAST_OWN * told + 1e-300))
         covariance += np.outer(shift, shift)
     common = (scaled * (covariance.astype(np.float32) @ scaled)).sum(axis=0)
-    kept = np.delete(np.arange(len(S)), _stretches(len(at.T), poses) if at.stretch is not None else [])
+    kept = np.delete(np.arange(len(S)), _turns(len(at.T), poses) if at.turn is not None else [])
     covariance = covariance[np.ix_(kept, kept)]
     with np.errstate(divide="ignore"):
         variance = sigma**2 / system.C + common
-    return Adjusted(at, found.iterations, sigma, found.cost, covariance, variance, common)
+    return Adjusted(found.estimate, found.iterations, sigma, found.cost, covariance, variance, common)
 
 
 def _without(S: Float64, where: np.ndarray, values: Float64) -> Float64:
     """What all others [P] would move by if those at ``where`` did not have their values: how far errors that are alike
-    all over an image draw them, of which a stretch is one sort only."""
+    all over an image draw them, of which a turn is one sort only."""
     others = np.delete(np.arange(len(S)), where)
     shift = np.zeros(len(S))
     shift[others] = _inverse(S[np.ix_(others, others)]) @ (S[np.ix_(others, where)] @ values)

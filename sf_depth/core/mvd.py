@@ -31,11 +31,14 @@ _LEAST_CONTRAST = 2.0  # grey levels; below it an image is blank
 _CHECK_ROUNDS = 2  # the checks and dense BA improve each other
 _NOISY_POSES = 1.5  # given poses that leave so many times the residual of free ones are refined
 _LEAST_KEPT = 0.3  # share of the correspondences that given poses have to explain to be kept at all
-_BENT = {"none": "lens", "f": "radial"}  # what is free with a radial term
-_LENS = 0.01  # share of the cost that a radial term has to explain; 0.003 is the most where there is no lens
+_LENS = 0.01  # share of the cost that a radial term beside a focal length has to explain; 0.003 without a lens
 _SURE = 0.01  # deviation of an unknown focal length; less sure, it and the radial term make up for each other
-_SHARED = 0.12  # share of the cost that stretches have to explain; on simulated images it is 0.005 at most
 _LENS_THINNING = 3  # every n-th of the pixels of dense BA tells whether there is a lens
+_BENDS = 0.5  # px at a width of 640; a lens that moves the corners of the image by less is none
+# Prior deviation of what sources turn by while they are read, and the share of the cost that it has to explain beside
+# known and unknown intrinsics: of a camera that reads at once and errs alike all over its image, and of one that reads
+# row by row. Simulated images reach 0.01, photo sets 0.25: an unknown focal length and turns make up for each other.
+_TURNS = ((0.0007, 0.12, 0.12), (0.004, 0.12, 0.27))
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
 _BLOCK = 1 << 15  # pixels solved at once: their arrays stay in the cache
 CONTRADICTED = "given poses contradict the images: refined, they only give the scale, and the variance tells how well"
@@ -140,9 +143,9 @@ class MultiViewDepth:
             pairs = self._match(reference, sources, guess)
             at = fit.adjusted.estimate
             at = _triangulated(pairs.seen, at.theta, at.T)
-            fit = self._check_and_adjust(pairs.seen, at, size, not kept, free, T is None)
+            fit = self._check_and_adjust(pairs.seen, at, size, not kept, free)
         if T is None:
-            fit = self._with_lens(pairs.seen, fit, size, free)
+            fit = self._with_lens_and_turns(pairs.seen, fit, size, free)
             fit = self._with_usual_focal(pairs.seen, fit, size, free)
         if theta is not None and T is not None:
             fit = self._refine_noisy_poses(pairs.seen, fit, size) if kept else _scaled(fit, T)
@@ -170,7 +173,7 @@ class MultiViewDepth:
         return matched(target, weight, self._config.stride, size)
 
     def _check_and_adjust(
-        self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str, stretch: bool = False
+        self, seen: Observations, at: Estimate, size: Size, poses: bool, intrinsics: str, turn: bool = False
     ) -> _Fit:
         """Dense BA over what passes the checks; both run again with the better geometry.
 
@@ -187,32 +190,32 @@ class MultiViewDepth:
             good = Observations(seen.uv, seen.target, weight)
             found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
             at = found.estimate
-            if stretch and last:
-                drawn = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, stretch=True)
-                found = drawn if drawn.cost < (1.0 - _SHARED) * found.cost else found
+            steady = found.cost
+            for deviation, known, unknown in _TURNS if turn and last else ():
+                turned = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, turn=deviation)
+                share = known if intrinsics in ("none", "lens") else unknown
+                found = turned if turned.cost < (1.0 - share) * steady else found
         return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
 
-    def _with_lens(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
-        """The fit with a radial term where the images show a lens, otherwise as it was.
+    def _with_lens_and_turns(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
+        """The fit with what cameras add to a pinhole: a radial term, and turns while their rows are read.
 
-        Beside an unknown focal length only where the views tell both; as the two make up for each other, what the
-        lens moves the focal length by counts as unsure in it, in the share of the cost that it leaves.
+        Beside an unknown focal length a radial term is free only where the views tell both; as the two make up for
+        each other, what it moves the focal length by counts as unsure in that, in the share of the cost that it leaves.
         """
-        bent = _BENT.get(free) if self._lens else None
-        if bent is None:
+        bent = "lens" if self._lens and free == "none" else free
+        fit = self._check_and_adjust(seen, fit.adjusted.estimate, size, True, bent, True)
+        if not self._lens or free != "f":
             return fit
         few, at = thinned(fit.seen, fit.adjusted.estimate, _LENS_THINNING)
-        drawn = at.stretch is not None
-        straight = dense_ba.optimum(few, at, intrinsics=free, stretch=drawn)
-        found = dense_ba.optimum(few, straight.estimate, intrinsics=bent, stretch=drawn)
-        if found.cost > (1.0 - _LENS) * straight.cost:
+        turn = 0.0 if at.turn is None else at.turn_deviation
+        straight = dense_ba.optimum(few, at, intrinsics=free, turn=turn)
+        found = dense_ba.optimum(few, straight.estimate, intrinsics="radial", turn=turn)
+        deviation = dense_depth.focal_deviation(dense_ba.with_covariance(few, found, True, "radial"))
+        if found.cost > (1.0 - _LENS) * straight.cost or deviation > _SURE:
             return fit
-        if free == "f":
-            deviation = dense_depth.focal_deviation(dense_ba.with_covariance(few, found, True, bent))
-            if deviation > _SURE:
-                return fit
         at = replace(found.estimate, inverse_depth=fit.adjusted.estimate.inverse_depth)
-        lens = self._check_and_adjust(seen, at, size, True, bent, True)
+        lens = self._check_and_adjust(seen, at, size, True, "radial", True)
         moved = np.log(lens.adjusted.estimate.theta[0] / fit.adjusted.estimate.theta[0]) * found.cost / straight.cost
         return replace(lens, focal_deviation=float(np.hypot(lens.unsure, moved)))
 
@@ -282,7 +285,7 @@ def _triangulated(seen: Observations, theta: Float64, T: Float64) -> Estimate:
 
 def _dense(pairs: Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
     """Inverse depth [H, W] of every pixel whose correspondences pass the checks."""
-    at = replace(fit.adjusted.estimate, stretch=None)  # what errors have in common is in all depths
+    at = fit.adjusted.estimate
     sigma = dense_ba.deviation(dense_ba.squared_residuals(fit.seen, at))
     grid = pixel_grid((size.height, size.width)).reshape(-1, 2)
     weight, target = pairs.weight.reshape(len(at.T), -1), pairs.target.reshape(len(at.T), -1, 2)
@@ -290,7 +293,7 @@ def _dense(pairs: Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
     def solved(index: np.ndarray) -> dense_depth.InverseDepth:
         uv, to = np.ascontiguousarray(grid[index].T), np.ascontiguousarray(target[:, index].transpose(0, 2, 1))
         trusted = checks.checked(weight[:, index], uv, to, at, size.width)
-        return dense_depth.solve(at, uv, to, trusted, sigma, size.width)
+        return dense_depth.solve(at, uv, dense_ba.steadied(at, to), trusted, sigma, size.width)
 
     seen = np.flatnonzero(weight.any(axis=0))
     parts = each(solved, np.array_split(seen, max(1, len(seen) // _BLOCK)))
@@ -305,6 +308,12 @@ def _dense(pairs: Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
 def registered(seen: Observations) -> np.ndarray:
     """Which sources keep enough correspondences to be placed, [S]."""
     return np.asarray((seen.weight > 0).sum(axis=1) >= _REGISTERED)
+
+
+def _shown(theta: Float64, size: Size) -> float:
+    """The radial term, 0 if it moves the corners of the image by next to nothing."""
+    corner = np.hypot(size.width / theta[0], size.height / theta[1]) / 2
+    return float(theta[4]) if abs(theta[4]) * corner**3 * theta[0] > _BENDS * size.unit else 0.0
 
 
 def _recovered(
@@ -333,7 +342,7 @@ def _recovered(
         registered(fit.seen),
         focal_sigma,
         adjusted.sigma,
-        float(at.theta[4]),
+        _shown(at.theta, size),
         fit.contradicted,
         fit.usual,
     )

@@ -108,10 +108,9 @@ def project_jacobian(theta: Float64, x: Float64) -> tuple[Float64, Float64, Floa
     return a + 2 * k1 * x[0] ** 2, 2 * k1 * x[0] * x[1], a + 2 * k1 * x[1] ** 2
 
 
-def project_parameters(theta: Float64, x: Float64, columns: Float64, drawn: Float64) -> Float64:
-    """d uv / d phi [2, K, N] at fixed normalised coordinates of an image that is ``drawn`` by a matrix [2, 2]."""
+def project_parameters(theta: Float64, x: Float64, columns: Float64) -> Float64:
+    """d uv / d phi [2, K, N] at fixed normalised coordinates."""
     r2 = (x * x).sum(axis=0)
-    x = drawn @ x
     distorted = x * (1.0 + theta[4] * r2)
     return np.stack(
         [

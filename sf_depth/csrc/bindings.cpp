@@ -17,18 +17,18 @@ using sf::alone, sf::In, sf::Made, sf::Out, sf::require;
 
 sf::Views views_of(const In<double, 5>& theta, const In<double, -1, 4, 4>& T, const In<double, 2, -1>& x,
                    const In<double, -1>& d, const In<double, -1, 2, -1>& target, const In<double, -1, -1>& weight,
-                   const In<double, -1, 2>& stretch) {
+                   const In<double, -1, 3>& turn) {
     const size_t sources = T.shape(0), pixels = x.shape(1);
     require(d.shape(0) == pixels && target.shape(0) == sources && target.shape(2) == pixels &&
-                weight.shape(0) == sources && weight.shape(1) == pixels && stretch.shape(0) == sources,
-            "x, d, T, target, weight and stretch differ in pixels or sources");
+                weight.shape(0) == sources && weight.shape(1) == pixels && turn.shape(0) == sources,
+            "x, d, T, target, weight and turn differ in pixels or sources");
     return {sources, pixels, theta.data(), T.data(), x.data(), d.data(), target.data(), weight.data(),
-            stretch.data()};
+            turn.data()};
 }
 
 Out<float> squared_residuals(In<double, 5> theta, In<double, -1, 4, 4> T, In<double, 2, -1> x, In<double, -1> d,
-                             In<double, -1, 2, -1> target, In<double, -1, -1> weight, In<double, -1, 2> stretch) {
-    const sf::Views views = views_of(theta, T, x, d, target, weight, stretch);
+                             In<double, -1, 2, -1> target, In<double, -1, -1> weight, In<double, -1, 3> turn) {
+    const sf::Views views = views_of(theta, T, x, d, target, weight, turn);
     Made<float> squares({views.sources, views.pixels});
     alone([&] { sf::squared_residuals(views, squares.get()); });
     return squares.give();
@@ -42,11 +42,11 @@ nb::tuple robust_cost(In<float, -1, -1> squares, In<double, -1, -1> weight, doub
 }
 
 nb::tuple linearise(In<double, 5> theta, In<double, -1, 4, 4> T, In<double, 2, -1> x, In<double, -1> d,
-                    In<double, -1, 2, -1> target, In<double, -1, -1> weight, In<double, -1, 2> stretch,
-                    In<float, 2, -1, -1> dx, In<double, 5, -1> columns, bool poses, bool stretches, double c2,
+                    In<double, -1, 2, -1> target, In<double, -1, -1> weight, In<double, -1, 3> turn,
+                    In<float, 2, -1, -1> dx, In<double, 5, -1> columns, bool poses, bool turns, double c2,
                     bool scores) {
-    const sf::Views views = views_of(theta, T, x, d, target, weight, stretch);
-    const sf::Free own{poses, stretches};
+    const sf::Views views = views_of(theta, T, x, d, target, weight, turn);
+    const sf::Free own{poses, turns};
     const size_t free_ones = columns.shape(1), N = views.pixels;
     require(free_ones <= 4 && dx.shape(1) == free_ones && (free_ones == 0 || dx.shape(2) == N),
             "dx does not fit the columns, at most 4, and x");
@@ -123,11 +123,11 @@ Out<float> settle(In<float, -1, -1, 4> values, In<float, -1, -1, 4> inflow, In<f
 NB_MODULE(_native, m) {
     m.doc() = "Compiled kernels of the depth block; the *_reference.py files of its core define them.";
     m.def("squared_residuals", &squared_residuals, nb::arg("theta"), nb::arg("T"), nb::arg("x"), nb::arg("d"),
-          nb::arg("target"), nb::arg("weight"), nb::arg("stretch"));
+          nb::arg("target"), nb::arg("weight"), nb::arg("turn"));
     m.def("robust_cost", &robust_cost, nb::arg("squares"), nb::arg("weight"), nb::arg("c2"), nb::arg("blind"));
     m.def("linearise", &linearise, nb::arg("theta"), nb::arg("T"), nb::arg("x"), nb::arg("d"), nb::arg("target"),
-          nb::arg("weight"), nb::arg("stretch"), nb::arg("dx"), nb::arg("columns"), nb::arg("poses"),
-          nb::arg("stretches"), nb::arg("c2"), nb::arg("scores"));
+          nb::arg("weight"), nb::arg("turn"), nb::arg("dx"), nb::arg("columns"), nb::arg("poses"),
+          nb::arg("turns"), nb::arg("c2"), nb::arg("scores"));
     m.def("eliminate", &eliminate, nb::arg("E"), nb::arg("C"), nb::arg("w"), nb::arg("H"), nb::arg("g"));
     m.def("substitute", &substitute, nb::arg("E"), nb::arg("C"), nb::arg("w"), nb::arg("dx"));
     m.def("dissimilarity", &dissimilarity, nb::arg("first"), nb::arg("mean"), nb::arg("scale"), nb::arg("others"),

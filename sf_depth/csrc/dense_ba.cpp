@@ -14,42 +14,50 @@ namespace {
 
 constexpr double kMinZ = 0.05;      // of the reference depth
 constexpr size_t kBlock = 512;      // pixels
-constexpr size_t kPose = 6, kStretch = 2, kFree = 4, kMost = kPose + kStretch + kFree;  // columns of one source
+constexpr size_t kPose = 6, kTurn = 3, kFree = 4, kMost = kPose + kTurn + kFree;  // columns of one source
 
 // Eight reference pixels in one source.
 struct Seen {
-    Double8 X[3];     // point in units of the reference depth
+    Double8 X[3];     // point in units of the reference depth, as its row sees it
+    Double8 row;      // tangent of that row
     Double8 u, v;     // residual px; 0 where it does not count
     Double8 weight;   // 0 where it does not count
     Long8 blind;      // behind the source, or too near
 };
 
 SF_INLINE Seen see(const Views& p, size_t j, size_t k, size_t count) {
-    const double *T = p.T + 16 * j, *theta = p.theta, *target = p.target + 2 * j * p.pixels;
+    const double *T = p.T + 16 * j, *theta = p.theta, *target = p.target + 2 * j * p.pixels, *turn = p.turn + 3 * j;
     const Double8 x = load<Double8>(p.x + k, count), y = load<Double8>(p.x + p.pixels + k, count);
     const Double8 d = load<Double8>(p.d + k, count);
     Seen s;
-    for (int i = 0; i < 3; ++i) s.X[i] = T[4 * i] * x + T[4 * i + 1] * y + T[4 * i + 2] + T[4 * i + 3] * d;
-    s.blind = s.X[2] < kMinZ;
     s.weight = load<Double8>(p.weight + j * p.pixels + k, count);
+    const Double8 u = load<Double8>(target + k, count), v = load<Double8>(target + p.pixels + k, count);
+    s.row = s.weight > 0.0 ? (v - theta[3]) / theta[1] : Double8{};
+    Double8 X[3];
+    for (int i = 0; i < 3; ++i) X[i] = T[4 * i] * x + T[4 * i + 1] * y + T[4 * i + 2] + T[4 * i + 3] * d;
+    for (int i = 0; i < 3; ++i) {
+        const int n = (i + 1) % 3, m = (i + 2) % 3;
+        s.X[i] = X[i] + s.row * (turn[n] * X[m] - turn[m] * X[n]);
+    }
+    s.blind = s.X[2] < kMinZ;
     s.weight = s.blind ? Double8{} : s.weight;
     const Double8 iz = 1.0 / (s.blind ? Double8{} + kMinZ : s.X[2]), a = s.X[0] * iz, b = s.X[1] * iz;
     const Double8 drawn = 1.0 + theta[4] * (a * a + b * b);
-    const double *stretch = p.stretch + 2 * j, across = stretch[1];
-    s.u = load<Double8>(target + k, count) - (theta[0] * ((1.0 + stretch[0]) * a + across * b) * drawn + theta[2]);
-    s.v = load<Double8>(target + p.pixels + k, count) - (theta[1] * ((1.0 - stretch[0]) * b + across * a) * drawn + theta[3]);
+    s.u = u - (theta[0] * a * drawn + theta[2]);
+    s.v = v - (theta[1] * b * drawn + theta[3]);
     const Long8 counts = s.weight > 0.0;
     s.u = counts ? s.u : Double8{};
     s.v = counts ? s.v : Double8{};
     return s;
 }
 
-// Derivatives of the projection: A [rows, 2] by pose, stretch and intrinsics, a [2] by inverse depth.
+// Derivatives of the projection: A [rows, 2] by pose, turn and intrinsics, a [2] by inverse depth. What a turn changes
+// of the others is left out: it is a few thousandths.
 struct Jacobian {
     Float8 A[kMost][2], a[2];
 };
 
-// Where the columns of a source begin among all: poses, then stretches, then intrinsics.
+// Where the columns of a source begin among all: poses, then turns, then intrinsics.
 struct Layout {
     Free own;
     size_t sources, pose, first, free;
@@ -58,25 +66,17 @@ struct Layout {
         : own(own_), sources(sources_), pose(own.poses ? kPose : 0), first(own.columns()), free(first * sources) {}
     size_t row(size_t j, size_t column) const {
         if (column < pose) return pose * j + column;
-        if (column < first) return pose * sources + kStretch * j + column - pose;
+        if (column < first) return pose * sources + kTurn * j + column - pose;
         return free + column - first;
     }
 };
-
-// (u, v) of an image that is drawn by the stretch of a source.
-SF_INLINE void draw(const Views& p, size_t j, Float8 (&image)[2]) {
-    const double *stretch = p.stretch + 2 * j, aspect = p.theta[0] / p.theta[1];
-    const float along = stretch[0], uv = stretch[1] * aspect, vu = stretch[1] / aspect;
-    const Float8 u = image[0], v = image[1];
-    image[0] = (1.0f + along) * u + uv * v;
-    image[1] = (1.0f - along) * v + vu * u;
-}
 
 SF_INLINE void differentiate(const Views& p, const Intrinsics& free, Free parts, size_t j, size_t k, size_t count,
                              const Seen& s, Jacobian& out) {
     const double* T = p.T + 16 * j;
     const float fx = p.theta[0], fy = p.theta[1], k1 = p.theta[4];
-    const Float8 X[3] = {single(s.X[0]), single(s.X[1]), single(s.X[2])}, d = single(load<Double8>(p.d + k, count));
+    const Float8 X[3] = {single(s.X[0]), single(s.X[1]), single(s.X[2])}, row = single(s.row);
+    const Float8 d = single(load<Double8>(p.d + k, count));
     const Float8 near = Float8{} + static_cast<float>(kMinZ), iz = 1.0f / (X[2] < near ? near : X[2]);
     const Float8 x = X[0] * iz, y = X[1] * iz, r2 = x * x + y * y, drawn = 1.0f + k1 * r2;
     Float8 J[3][2];  // by the point
@@ -84,30 +84,21 @@ SF_INLINE void differentiate(const Views& p, const Intrinsics& free, Free parts,
     J[0][1] = fy * iz * (2 * k1 * x * y);
     J[1][0] = fx * iz * (2 * k1 * x * y);
     J[1][1] = fy * iz * (drawn + 2 * k1 * y * y);
-    for (int i = 0; i < 2; ++i) draw(p, j, J[i]);
     const float t[3] = {static_cast<float>(T[3]), static_cast<float>(T[7]), static_cast<float>(T[11])};
     const size_t first = parts.columns();
     for (int i = 0; i < 2; ++i) {
         J[2][i] = -(x * J[0][i] + y * J[1][i]);
         out.a[i] = t[0] * J[0][i] + t[1] * J[1][i] + t[2] * J[2][i];
-        if (!parts.poses) continue;
-        for (int c = 0; c < 3; ++c) out.A[c][i] = J[c][i] * d;
-        out.A[3][i] = X[1] * J[2][i] - X[2] * J[1][i];
-        out.A[4][i] = X[2] * J[0][i] - X[0] * J[2][i];
-        out.A[5][i] = X[0] * J[1][i] - X[1] * J[0][i];
-    }
-    if (parts.stretch) {
-        const Float8 along[2] = {fx * x * drawn, -fy * y * drawn}, across[2] = {fx * y * drawn, fy * x * drawn};
-        for (int i = 0; i < 2; ++i) {
-            out.A[first - 2][i] = along[i];
-            out.A[first - 1][i] = across[i];
+        const Float8 turned[3] = {X[1] * J[2][i] - X[2] * J[1][i], X[2] * J[0][i] - X[0] * J[2][i],
+                                  X[0] * J[1][i] - X[1] * J[0][i]};
+        for (int c = 0; c < 3; ++c) {
+            if (parts.poses) out.A[c][i] = J[c][i] * d;
+            if (parts.poses) out.A[3 + c][i] = turned[c];
+            if (parts.turn) out.A[first - kTurn + c][i] = row * turned[c];
         }
     }
     if (free.count == 0) return;
-    const double *stretch = p.stretch + 2 * j;
-    const float plus = 1.0 + stretch[0], minus = 1.0 - stretch[0], cross = stretch[1];
-    const Float8 own[2] = {(plus * x + cross * y) * drawn, (minus * y + cross * x) * drawn};
-    const Float8 bent[2] = {fx * (plus * x + cross * y) * r2, fy * (minus * y + cross * x) * r2};
+    const Float8 own[2] = {x * drawn, y * drawn}, bent[2] = {fx * x * r2, fy * y * r2};
     for (size_t f = 0; f < free.count; ++f) {
         const Float8 du = load<Float8>(free.dx + f * p.pixels + k, count);
         const Float8 dv = load<Float8>(free.dx + (free.count + f) * p.pixels + k, count);

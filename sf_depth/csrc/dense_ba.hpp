@@ -13,13 +13,13 @@ struct Views {
     const double* d;       // [N] inverse depth
     const double* target;  // [S, 2, N] px; anything where the weight is 0
     const double* weight;  // [S, N]
-    const double* stretch; // [S, 2] s, t: the image of a source is drawn by (1 + s, t; t, 1 - s)
+    const double* turn;    // [S, 3] rotation of a source while its rows are read, rad per unit of the row's tangent
 };
 
 // What is free of a source.
 struct Free {
-    bool poses, stretch;
-    size_t columns() const { return (poses ? 6 : 0) + (stretch ? 2 : 0); }
+    bool poses, turn;
+    size_t columns() const { return (poses ? 6 : 0) + (turn ? 3 : 0); }
 };
 
 struct Intrinsics {
@@ -29,7 +29,7 @@ struct Intrinsics {
 };
 
 struct Equations {
-    double* H;      // [P, P] of poses, stretches and intrinsics, in this order
+    double* H;      // [P, P] of poses, turns and intrinsics, in this order
     double* g;      // [P]
     float* E;       // [P, N] coupling with the inverse depths
     float* C;       // [N] of the inverse depths

@@ -37,9 +37,9 @@ void adjust(size_t sources, size_t pixels, size_t free_count, sf::Free own, size
     const auto T = numbers<double>(16 * sources, -1, 1, 1, each), x = numbers<double>(2 * pixels, -1, 1, 2, each),
                d = numbers<double>(pixels, 0.1, 2, 3, each), target = numbers<double>(2 * sources * pixels, 0, 60, 4, each),
                weight = numbers<double>(sources * pixels, 0, 1, 5, each),
-               stretch = numbers<double>(2 * sources, -0.1, 0.1, 8, each), columns = numbers<double>(5 * free_count, 0, 1, 6, 0);
+               turn = numbers<double>(3 * sources, -0.1, 0.1, 8, each), columns = numbers<double>(5 * free_count, 0, 1, 6, 0);
     const auto dx = numbers<float>(2 * free_count * pixels, -1, 1, 7, each);
-    const sf::Views views{sources, pixels, theta, T.data(), x.data(), d.data(), target.data(), weight.data(), stretch.data()};
+    const sf::Views views{sources, pixels, theta, T.data(), x.data(), d.data(), target.data(), weight.data(), turn.data()};
     const size_t rows = own.columns() * sources + free_count;
     std::vector<float> squares(sources * pixels), E(rows * pixels), C(pixels), w(pixels), scores(rows * pixels);
     std::vector<double> H(rows * rows), g(rows), S(rows * rows), b(rows), step(rows, 0.01), dd(pixels);
