@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from common import Benchmark, print_rows
 
@@ -35,8 +34,11 @@ GIVEN = se3.orthonormalise(
         ]
     )
 )
-# Frames of 7-Scenes: all, before the lost depth image, and the two parts of those.
-PARTS = {"0-199": (1, 199), "0-99": (1, 99), "101-176": (101, 177)}
+# Frames of 7-Scenes: all, and two parts before the lost depth image.
+PARTS = {"0-199": range(1, 199, 3), "0-99": range(1, 100, 2), "101-176": range(101, 177, 2)}
+# Scene -> lag, s.
+SCENES = {"room0": 0.012, "office0": 0.0, "lounge": 0.020, "room": 0.0, "hall": -0.010, "office3": 0.008}
+QUICK_SCENES = ("room0", "lounge")
 # Rotations by which the claimed pose of a simulated depth camera is wrong, deg about its x, y and z.
 ERRORS_DEG = ((0.0, 0.0, 0.0), (0.3, -0.6, 0.5), (-1.0, 0.4, -0.8), (0.1, 0.1, 0.0))
 BASELINE = np.array([-0.025, 0.002, 0.001])  # m, from the depth to the colour camera
@@ -92,3 +94,94 @@ def found(shots: Iterable[Shot], depth: Camera, color: Camera, T_color_depth: Fl
     for shot in shots:
         views.add(shot)
     return align(views)
+
+
+def seven_scenes(folder: Path, frames: Iterable[int]) -> Iterator[Shot]:
+    """Raw depth, not registered, with the colour images around it."""
+    for k in frames:
+        images = [read_rgb(folder / f"frame-{j:06d}.color.jpg") for j in (k - 1, k, k + 1)]
+        stamps = [stamp_30hz(j) for j in (k - 1, k, k + 1)]
+        depth = read_depth(folder / f"frame-{k:06d}.depth.png", SevenScenes.depth_units or 1000.0)
+        yield Shot((stamps[0], stamps[1], stamps[2]), (images[0], images[1], images[2]), depth, stamps[1])
+
+
+def row_of(a: Alignment) -> dict[str, Any]:
+    """What a benchmark shows of an alignment."""
+    jump = a.jump
+    return {
+        "frames": f"{a.used}/{a.frames}",
+        "off px": a.off_px,
+        "right px": float(a.offset_px[0]),
+        "down px": float(a.offset_px[1]),
+        "score": a.score,
+        "corrected": a.score_corrected,
+        "by chance": a.score_chance,
+        "rotation deg": " ".join(f"{v:.2f}" for v in np.degrees(a.rotation)),
+        "halves px": a.halves_px,
+        "halves deg": float(np.degrees(a.halves_rad)),
+        "lag ms": "not told" if a.lag_s is None else round(1e3 * a.lag_s, 2),
+        "halves ms": 1e3 * a.halves_lag_s,
+        "jump": "none" if jump is None else f"{jump.seconds / a.period_s:.2f} frames",
+        "jump after": "" if jump is None else round((jump.after_ns - stamp_30hz(0)) * 30e-9),
+        "jump before": "" if jump is None else round((jump.before_ns - stamp_30hz(0)) * 30e-9),
+    }
+
+
+def real(folder: Path) -> list[dict[str, Any]]:
+    """7-Scenes with the extrinsic that came with it, and with the one in use."""
+    rows = []
+    for claimed, T in (("given", GIVEN), ("in use", SevenScenes.T_COLOR_DEPTH)):
+        for name, frames in PARTS.items():
+            a = found(seven_scenes(folder, frames), SevenScenes.DEPTH_CAMERA, SevenScenes.COLOR_CAMERA, T)
+            rows.append({"extrinsic": claimed, "of": name, **(row_of(a) if a else {"frames": "not told"})})
+            print_rows(rows[-1:])
+    return rows
+
+
+def simulated(scene: str, count: int) -> list[dict[str, Any]]:
+    """Claimed poses that are wrong by known rotations, a lag and a lost image that are known."""
+    spec = replace(PRESETS.get(scene) or SimulationSpec(scene), width=640, height=480, focal=480.0, fps=30.0)
+    rig = Rig(spec, SCENES[scene], every=1.0)
+    shots = list(rig.shots(count))
+    slipped = [s if k < 0.7 * count else replace(s, depth_ns=s.depth_ns - 33_333_333) for k, s in enumerate(shots)]
+    cases = [(str(error), error, shots) for error in ERRORS_DEG] + [("one image lost", (0.3, -0.6, 0.5), slipped)]
+    rows = []
+    for name, error, used in cases:
+        claimed = _turned(error) @ rig.T_color_depth
+        a = found(used, rig.depth, rig.color, claimed)
+        row: dict[str, Any] = {"scene": scene, "wrong by deg": name}
+        if a is None:
+            rows.append({**row, "frames": "not told"})
+            continue
+        left = np.degrees(se3.log(a.corrected(claimed) @ se3.inverse(rig.T_color_depth))[3:])
+        lag = None if a.lag_s is None else 1e3 * abs(a.lag_s - rig.lag_s)
+        row |= {"error deg": float(np.linalg.norm(left)), "error ms": "not told" if lag is None else round(lag, 2)}
+        rows.append({**row, **row_of(a)})
+        print_rows(rows[-1:])
+    return rows
+
+
+def _turned(degrees: tuple[float, float, float]) -> Float64:
+    return se3.exp(np.array([0.0, 0.0, 0.0, *np.radians(degrees)]))
+
+
+def main() -> None:
+    """Both, one table each."""
+    bench = Benchmark("registration", __doc__.splitlines()[0])
+    bench.parser.add_argument("--data", type=Path, help="folder of real recordings")
+    bench.parser.add_argument("--scenes", nargs="*", choices=sorted(SCENES), default=list(QUICK_SCENES))
+    bench.parser.add_argument("--frames", type=int, default=24, help="of each simulated recording")
+    args = bench.parse()
+    bench.note(
+        "Rotations correct T_color_depth from the left. A positive lag: depth is older than its stamp says. Simulated "
+        "depth is that of a structured-light sensor with the shadow of its projector; motion is seen in colour alone."
+    )
+    tables = {}
+    if args.data is not None:
+        tables["7-Scenes RedKitchen"] = real(args.data / "rgbd_7scenes_redkitchen_000_199")
+    tables["simulated"] = [row for scene in args.scenes for row in simulated(scene, args.frames)]
+    bench.write("Depth on colour", tables)
+
+
+if __name__ == "__main__":
+    main()

@@ -43,7 +43,7 @@ class Jump:
 
     Args:
         after_ns, before_ns: stamps of the last frame before it and of the first one behind it.
-        seconds: by how much the lag grows (negative: a colour image was lost).
+        seconds: by how much the lag grows (negative: as if a depth image was lost; positive: a colour image).
     """
 
     after_ns: int
@@ -68,6 +68,8 @@ class Alignment:
         score, score_corrected, score_chance: mean gradient at the edges as given, corrected, and anywhere.
         near_far_px: after the correction, offset of the nearer half of the edges less that of the farther half.
         depth_m: median depth of the edges.
+        speed_px_s: median speed of the edges in the colour image.
+        period_s: median time between colour images.
     """
 
     frames: int
@@ -87,6 +89,8 @@ class Alignment:
     score_chance: float
     near_far_px: Float64
     depth_m: float
+    speed_px_s: float
+    period_s: float
 
     def corrected(self, T_color_depth: Float64) -> Float64:
         """The pose of the depth camera with the rotation that was found."""
@@ -144,6 +148,8 @@ def _judged(found: EdgeViews, views: list[EdgeView], start: Float64, told: bool,
         score_chance=everything.chance(),
         near_far_px=grow * (sides[0] - sides[1]),
         depth_m=float(np.median(everything.depth)),
+        speed_px_s=grow * everything.speed,
+        period_s=float(np.median([view.period for view in views])),
     )
 
 
@@ -235,6 +241,7 @@ class _Edges:
         self._axis = (turned[:, 1] > turned[:, 0]).astype(np.intp)
         self._start = (2 * self._image + self._axis) * (camera.width * camera.height)  # of its image, of all pixels
         self.depth = self._points[:, 2]
+        self.speed = float(np.median(np.linalg.norm(self._flow, axis=1)))
 
     def _uv(self, p: Float64) -> Float64:
         return self._camera.project(se3.transform(_turned(p), self._points))[0] + (self._ahead + p[3]) * self._flow
