@@ -42,11 +42,12 @@ QUICK_SCENES = ("room0", "lounge")
 # Rotations by which the claimed pose of a simulated depth camera is wrong, deg about its x, y and z.
 ERRORS_DEG = ((0.0, 0.0, 0.0), (0.3, -0.6, 0.5), (-1.0, 0.4, -0.8), (0.1, 0.1, 0.0))
 BASELINE = np.array([-0.025, 0.002, 0.001])  # m, from the depth to the colour camera
+SWAY_DEG, SWAY_HZ = (1.0, 1.5, 0.5), (0.7, 0.45, 0.3)  # of the hand, about x, y and z of the camera
 PROJECTOR = 0.075  # m, to the right of the depth camera
 
 
 class Rig:
-    """A simulated colour camera with a depth camera beside it that has a lens, a place and a clock of its own.
+    """A simulated hand-held colour camera with a depth camera beside it that has its own lens, place and clock.
 
     Args:
         lag_s: the depth image shows what was so long before its stamp.
@@ -68,15 +69,20 @@ class Rig:
             times = [(k + 0.5) * self.every + j * period for j in (-1, 0, 1)]
             stamps = [round(1e9 * (1 + t)) for t in times]
             images = [self._image(t) for t in times]
-            T = self.simulator.path.pose(times[1] - self.lag_s) @ self.T_color_depth
+            T = self._pose(times[1] - self.lag_s) @ self.T_color_depth
             z = self.simulator.renderer.render(self.depth, T, 1)[1]
             if self.noisy:
                 rng = np.random.default_rng([spec.seed, 7, k])
                 z = np.where(shadowed(z, self.depth.fx), np.nan, structured_light(z, self.depth.fx, rng))
             yield Shot((stamps[0], stamps[1], stamps[2]), (images[0], images[1], images[2]), DepthMap(z), stamps[1])
 
+    def _pose(self, t: float) -> Float64:
+        """T_map_camera: the path of the scene, not quite steadily."""
+        sway = np.radians(SWAY_DEG) * np.sin(2 * np.pi * np.array(SWAY_HZ) * t)
+        return np.asarray(self.simulator.path.pose(t) @ se3.exp(np.array([0.0, 0.0, 0.0, *sway])))
+
     def _image(self, t: float) -> np.ndarray:
-        image = self.simulator.renderer.render(self.color, self.simulator.path.pose(t), 1)[0]
+        image = self.simulator.renderer.render(self.color, self._pose(t), 1)[0]
         rng = np.random.default_rng([self.simulator.spec.seed, 8, round(1e6 * t)])
         return np.clip(image + rng.standard_normal(image.shape) + 0.5, 0, 255).astype(np.uint8)
 

@@ -28,8 +28,9 @@ _RADIUS = 32  # px, the largest shift that is found
 _FEW_EDGES = 150  # a depth image with fewer says nothing
 _CLEAR = 1.35  # clarity from which on the shift of one frame counts; without any relation it is 1.1 to 1.3
 _FEW_FRAMES = 10  # frames that count; with fewer nothing is said
-_NOISE_PX = 0.7  # shifts of single frames that deviate by more from the common line count less
-_LAG_TOLD_S = 0.004  # deviation of a lag above which the motion was too little
+_NOISE_PX = 0.3  # deviation of the shift of a single frame
+_LOOSE_PX = 0.7  # shifts that are off the common line by more count less
+_LAG_TOLD_S = 0.004  # deviation of the lag from which on the motion was too little
 _JUMP_FRAMES = 0.6  # a change of the lag by less is none
 _JUMP_GAIN = 12.0  # log-likelihood by which a jump explains the shifts better; chance makes a few
 _JUMP_SIDE = 4  # frames on either side of a jump
@@ -135,7 +136,7 @@ def _judged(found: EdgeViews, views: list[EdgeView], start: Float64, told: bool,
         used=len(views),
         offset_px=grow * everything.offset(best * (0, 0, 0, 1)),
         off_px=grow * everything.distance(best, best * (0, 0, 0, 1)),
-        left_px=grow * float(np.linalg.norm(everything.offset(best))),
+        left_px=float(grow * np.linalg.norm(everything.offset(best))),
         rotation=best[:3],
         halves_px=grow * everything.distance(a * (1, 1, 1, 0), b * (1, 1, 1, 0)),
         halves_rad=float(np.linalg.norm(a[:3] - b[:3])),
@@ -182,8 +183,9 @@ class _Line:
 
 def _line(shifts: Float64, flow: Float64) -> _Line:
     """What is the same in the shifts of all frames, and what follows the motion."""
-    x, _, deviation = _robust(shifts, flow[..., None])
-    if deviation[2] < _LAG_TOLD_S:
+    spread = np.sqrt(((flow - flow.mean(axis=0)) ** 2).sum())  # px/s; a steady motion is like a turn
+    if _LAG_TOLD_S * spread > _NOISE_PX:
+        x, _, _ = _robust(shifts, flow[..., None])
         return _Line(x[:2], float(x[2]), True)
     return _Line(_robust(shifts, np.zeros((*flow.shape, 0)))[0], 0.0, False)
 
@@ -216,11 +218,10 @@ def _robust(shifts: Float64, flows: Float64) -> tuple[Float64, float, Float64]:
     for _ in range(20):
         x = np.linalg.lstsq(A * weight[:, None], b * weight, rcond=None)[0]
         off = b - A @ x
-        weight = 1 / np.sqrt(1 + (off / _NOISE_PX) ** 2)
-    cost = float(np.log1p((off / _NOISE_PX) ** 2).sum())
-    spread = max(1.5 * float(np.median(np.abs(off))), 0.3 * _NOISE_PX)
+        weight = 1 / np.sqrt(1 + (off / _LOOSE_PX) ** 2)
+    cost = float(np.log1p((off / _LOOSE_PX) ** 2).sum())
     information = (A * weight[:, None] ** 2).T @ A
-    return x, cost, spread * np.sqrt(np.diag(np.linalg.pinv(information)) + 1e9 * (np.diag(information) < 1e-9))
+    return np.asarray(x, np.float64), cost, np.asarray(_NOISE_PX * np.sqrt(np.diag(np.linalg.pinv(information))))
 
 
 class _Edges:
@@ -244,7 +245,8 @@ class _Edges:
         self.speed = float(np.median(np.linalg.norm(self._flow, axis=1)))
 
     def _uv(self, p: Float64) -> Float64:
-        return self._camera.project(se3.transform(_turned(p), self._points))[0] + (self._ahead + p[3]) * self._flow
+        uv, _ = self._camera.project(se3.transform(_turned(p), self._points))
+        return np.asarray(uv + (self._ahead + p[3]) * self._flow)
 
     def score(self, p: Float64) -> float:
         """Mean gradient at the edges, 0 ... 1."""

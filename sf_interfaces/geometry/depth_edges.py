@@ -135,8 +135,9 @@ def scores_of_shifts(uv: Float64, axis: NDArray[np.intp], found: Gradients, radi
     """
     side = 2 * radius + 1
     windows = sliding_window_view(found.along, (side, side), axis=(1, 2))  # [2, H - 2r, W - 2r, side, side]
-    with np.errstate(invalid="ignore"):
-        corner = np.nan_to_num(np.floor(uv), nan=-1e6).astype(np.int64) - radius
+    # An edge exactly between two pixels, as all are in registered depth, takes either by turns: no half pixel is lost.
+    pixel = np.where(np.arange(len(uv))[:, None] % 2, np.floor(uv), np.ceil(uv) - 1)
+    corner = np.nan_to_num(pixel, nan=-1e6).astype(np.int64) - radius
     inside = (corner >= 0).all(axis=1) & (corner < (windows.shape[2], windows.shape[1])).all(axis=1)
     if not inside.any():
         return np.full((side, side), np.nan)

@@ -91,4 +91,4 @@ class EdgeViews:
         field = self._flow.calc(half[0], half[1], None)
         limit = (field.shape[1] - 1, field.shape[0] - 1)
         column, row = np.clip(np.nan_to_num(uv / 2), 0, limit).astype(np.int64).T
-        return 2.0 * field[row, column].astype(np.float64)
+        return np.asarray(2.0 * field[row, column], np.float64)
