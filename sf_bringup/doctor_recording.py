@@ -58,10 +58,12 @@ def _space(found: Alignment, mounting: Mounting) -> Check:
         return Check(_SPACE, True, detail, "record more frames, with near and far things all over the image")
     right, down = found.offset_px
     degrees = np.degrees(np.linalg.norm(found.rotation))
+    alike = found.off_px * found.depth_m / mounting.color.fx
     detail = (
         f"{found.off_px:.1f} px off: to lie on colour it has to move {right:+.1f} px right, {down:+.1f} px down; "
         f"a turn of {degrees:.2f} deg brings the score to {found.score_corrected:.2f} from {scores} ({seen}, "
-        f"{np.degrees(found.halves_rad):.2f} deg){_place(found)}"
+        f"{np.degrees(found.halves_rad):.2f} deg){_place(found)}; a place that is {1e3 * alike:.0f} mm off would look alike "
+        f"at {found.depth_m:.1f} m, where the edges are"
     )
     return Check(_SPACE, False, detail, _turn(found, mounting))
 

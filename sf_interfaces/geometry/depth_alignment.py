@@ -24,7 +24,7 @@ from sf_interfaces.geometry.depth_edges import Gradients, best_shift, scores_of_
 from sf_interfaces.geometry.edge_views import EdgeView, EdgeViews
 from sf_interfaces.types import Camera, Float64
 
-_RADIUS = 32  # px, the largest shift that is found
+_RADIUS = 0.05  # of the image width, the largest shift that is found
 _FEW_EDGES = 150  # a depth image with fewer says nothing
 _CLEAR = 1.35  # clarity from which on the shift of one frame counts; without any relation it is 1.1 to 1.3
 _FEW_FRAMES = 10  # frames that count; with fewer nothing is said
@@ -34,6 +34,7 @@ _LAG_TOLD_S = 0.004  # deviation of the lag from which on the motion was too lit
 _JUMP_FRAMES = 0.6  # a change of the lag by less is none
 _JUMP_GAIN = 12.0  # log-likelihood by which a jump explains the shifts better; chance makes a few
 _JUMP_SIDE = 4  # frames on either side of a jump
+_BORDER_PX = 8  # edges nearer to the border of the image are not looked at
 _EDGES_OF_VIEW = 1000  # of each view, in the fit
 _UNITS = np.array([0.005, 0.005, 0.01, 0.01])  # rad and s, first steps of the fit
 
@@ -58,8 +59,8 @@ class Alignment:
 
     Args:
         frames, used: how many there were, and in how many the edges told where they belong.
-        offset_px: (right, down) by which the edges of all frames have to move, in the colour image.
-        off_px, left_px: mean length of the correction at the edges, and the offset that remains after it.
+        offset_px: (right, down), mean of the correction at the edges, in the colour image.
+        off_px: mean length of it; more than the length of its mean where depth is rolled.
         rotation: [3] rad, ``T_color_depth = exp(rotation) T_given``.
         halves_px, halves_rad: how much the rotations found in the first and the second half of the frames differ.
         confirmed: what was found in either half makes the edges of the other half fit better.
@@ -77,7 +78,6 @@ class Alignment:
     used: int
     offset_px: Float64
     off_px: float
-    left_px: Float64
     rotation: Float64
     halves_px: float
     halves_rad: float
@@ -111,7 +111,9 @@ def align(found: EdgeViews) -> Alignment | None:
     flow = np.array([np.median(view.flow, axis=0) for view in views])  # [N, 2] px/s
     first = _line(shifts, flow)
     start = np.array([-first.offset[1] / camera.fy, first.offset[0] / camera.fx, 0.0, first.lag])
-    turned = _Edges(views, camera, T).fit(start, first.told)
+    everything = _Edges(views, camera, T)
+    # Where much looks alike, single frames may agree on a wrong shift; all edges together judge better.
+    turned = everything.fit(max(start, start * (0, 0, 0, 1), key=everything.score), first.told)
     # A jump shows when what differs over the image, a roll above all, no longer blurs the shifts.
     kept, shifts = _telling(views, camera, _turned(turned) @ T)
     jump = _jump(kept, shifts) if first.told and len(kept) >= _FEW_FRAMES else None
@@ -130,15 +132,16 @@ def _judged(found: EdgeViews, views: list[EdgeView], start: Float64, told: bool,
     a, b = (half.fit(best, told) for half in halves)
     gains = [half.score(p) - half.score(p * (0, 0, 0, 1)) for half, p in zip(halves, (b, a), strict=True)]
     near = everything.depth < np.median(everything.depth)
-    sides = [everything.offset(best, chosen) for chosen in (near, ~near)]
+    sides = [everything.rest(best, chosen) for chosen in (near, ~near)]
+    move = everything.between(best * (0, 0, 0, 1), best)
+    apart = everything.between(a * (1, 1, 1, 0), b * (1, 1, 1, 0))
     return Alignment(
         frames=len(found.views),
         used=len(views),
-        offset_px=grow * everything.offset(best * (0, 0, 0, 1)),
-        off_px=grow * everything.distance(best, best * (0, 0, 0, 1)),
-        left_px=float(grow * np.linalg.norm(everything.offset(best))),
+        offset_px=grow * move.mean(axis=0),
+        off_px=float(grow * np.linalg.norm(move, axis=1).mean()),
         rotation=best[:3],
-        halves_px=grow * everything.distance(a * (1, 1, 1, 0), b * (1, 1, 1, 0)),
+        halves_px=float(grow * np.linalg.norm(apart, axis=1).mean()),
         halves_rad=float(np.linalg.norm(a[:3] - b[:3])),
         confirmed=min(gains) > 0,
         lag_s=float(best[3]) if told else None,
@@ -158,6 +161,10 @@ def _turned(p: Float64) -> Float64:
     return se3.exp(np.concatenate([np.zeros(3), p[:3]]))
 
 
+def _radius(camera: Camera) -> int:
+    return round(_RADIUS * camera.width)
+
+
 def _telling(views: Sequence[EdgeView], camera: Camera, T_color_depth: Float64) -> tuple[list[EdgeView], Float64]:
     """The views of which it is clear how far they are off, and these shifts, [N, 2] px."""
     kept, shifts = [], []
@@ -165,7 +172,7 @@ def _telling(views: Sequence[EdgeView], camera: Camera, T_color_depth: Float64) 
         if len(view.edges) < _FEW_EDGES:
             continue
         uv, axis = seen(view.edges, camera, T_color_depth)
-        shift = best_shift(scores_of_shifts(uv + view.ahead * view.flow, axis, view.gradients, _RADIUS))
+        shift = best_shift(scores_of_shifts(uv + view.ahead * view.flow, axis, view.gradients, _radius(camera)))
         if shift is not None and shift.clarity > _CLEAR:
             kept.append(view)
             shifts.append(shift.px)
@@ -229,17 +236,22 @@ class _Edges:
 
     def __init__(self, views: Sequence[EdgeView], camera: Camera, T_color_depth: Float64) -> None:
         self._camera = camera
-        steps = [-(-len(v.edges) // _EDGES_OF_VIEW) for v in views]
-        points = np.concatenate([v.edges.points[::n] for v, n in zip(views, steps, strict=True)])
-        outward = np.concatenate([v.edges.outward[::n] for v, n in zip(views, steps, strict=True)])
-        counts = [len(v.edges.points[::n]) for v, n in zip(views, steps, strict=True)]
-        self._flow = np.concatenate([v.flow[::n] for v, n in zip(views, steps, strict=True)])
-        self._ahead = np.repeat([v.ahead for v in views], counts)[:, None]
-        self._image = np.repeat(np.arange(len(views)), counts)
-        self._gradients = np.stack([v.gradients.along for v in views])  # [V, 2, H, W]
-        self._points = se3.transform(T_color_depth, points)  # [M, 3] m, colour camera as given
-        turned = np.abs(outward @ T_color_depth[:2, :3].T)
-        self._axis = (turned[:, 1] > turned[:, 0]).astype(np.intp)
+        size = np.array([camera.width, camera.height])
+        points, axes, flows, ahead, images = [], [], [], [], []
+        for k, view in enumerate(views):
+            uv, axis = seen(view.edges, camera, T_color_depth)
+            # Always the same edges: else the score would rise by moving those out of the image that fit badly.
+            inside = np.flatnonzero(((uv > _BORDER_PX) & (uv < size - _BORDER_PX)).all(axis=1))
+            chosen = inside[:: -(-len(inside) // _EDGES_OF_VIEW) or 1]
+            points.append(view.edges.points[chosen])
+            axes.append(axis[chosen])
+            flows.append(view.flow[chosen])
+            ahead.append(np.full((len(chosen), 1), view.ahead))
+            images.append(np.full(len(chosen), k))
+        self._points = se3.transform(T_color_depth, np.concatenate(points))  # [M, 3] m, colour camera as given
+        self._axis, self._image = np.concatenate(axes), np.concatenate(images)
+        self._flow, self._ahead = np.concatenate(flows), np.concatenate(ahead)
+        self._gradients = np.stack([view.gradients.along for view in views])  # [V, 2, H, W]
         self._start = (2 * self._image + self._axis) * (camera.width * camera.height)  # of its image, of all pixels
         self.depth = self._points[:, 2]
         self.speed = float(np.median(np.linalg.norm(self._flow, axis=1)))
@@ -249,7 +261,7 @@ class _Edges:
         return np.asarray(uv + (self._ahead + p[3]) * self._flow)
 
     def score(self, p: Float64) -> float:
-        """Mean gradient at the edges, 0 ... 1."""
+        """Mean gradient at the edges, 0 ... 1; 0 for an edge outside of the image."""
         at = self._uv(p) - 0.5  # gradients are at pixel centres
         corner = np.floor(at)
         width, g = self._camera.width, self._gradients.ravel()
@@ -258,7 +270,7 @@ class _Edges:
         first = self._start[inside] + v * width + u
         upper = g[first] * (1 - du) + g[first + 1] * du
         lower = g[first + width] * (1 - du) + g[first + width + 1] * du
-        return float(np.mean(upper * (1 - dv) + lower * dv)) / 255 if inside.any() else 0.0
+        return float(np.sum(upper * (1 - dv) + lower * dv)) / (255 * len(at))
 
     def fit(self, start: Float64, with_lag: bool) -> Float64:
         """The rotation, and the lag if asked for, with the highest score; begun at ``start``."""
@@ -271,23 +283,24 @@ class _Edges:
         x = minimize(cost, np.zeros(free), method="Powell", options=options).x
         return np.asarray(start + _UNITS * np.append(x, np.zeros(4 - free)))
 
-    def distance(self, p: Float64, q: Float64) -> float:
-        """Mean distance of the edges under two corrections, px."""
-        return float(np.mean(np.linalg.norm(self._uv(p) - self._uv(q), axis=1)))
+    def between(self, p: Float64, q: Float64) -> Float64:
+        """How the edges move from one correction to another, [M, 2] px."""
+        return self._uv(q) - self._uv(p)
 
-    def _shifted(self, p: Float64, chosen: NDArray[np.bool_]) -> Float64:
-        uv, total = self._uv(p), []
-        for k in range(len(self._gradients)):
-            mine = chosen & (self._image == k)
-            total.append(scores_of_shifts(uv[mine], self._axis[mine], Gradients(self._gradients[k]), _RADIUS))
-        return np.asarray(np.nanmean(total, axis=0))
-
-    def offset(self, p: Float64, chosen: NDArray[np.bool_] | None = None) -> Float64:
-        """By how much all or some of the edges are still off after a correction, px (NaN: not told)."""
-        everything = np.ones(len(self.depth), bool)
-        shift = best_shift(self._shifted(p, everything if chosen is None else chosen))
+    def rest(self, p: Float64, chosen: NDArray[np.bool_]) -> Float64:
+        """By how much some of the edges are still off after a correction, [2] px (NaN: not told)."""
+        shift = best_shift(self._shifted(p, chosen, _radius(self._camera) // 4))
         return np.full(2, np.nan) if shift is None else shift.px
 
     def chance(self) -> float:
         """Mean score over all shifts of the edges as given."""
-        return float(np.nanmean(self._shifted(np.zeros(4), np.ones(len(self.depth), bool))))
+        everything = np.ones(len(self.depth), bool)
+        return float(np.nanmean(self._shifted(np.zeros(4), everything, _radius(self._camera))))
+
+    def _shifted(self, p: Float64, chosen: NDArray[np.bool_], radius: int) -> Float64:
+        """The scores of shifts of some of the edges, mean of all views."""
+        uv, total = self._uv(p), []
+        for k in range(len(self._gradients)):
+            mine = chosen & (self._image == k)
+            total.append(scores_of_shifts(uv[mine], self._axis[mine], Gradients(self._gradients[k]), radius))
+        return np.asarray(np.nanmean(total, axis=0))
