@@ -62,8 +62,8 @@ def _space(found: Alignment, mounting: Mounting) -> Check:
     detail = (
         f"{found.off_px:.1f} px off: to lie on colour it has to move {right:+.1f} px right, {down:+.1f} px down; "
         f"a turn of {degrees:.2f} deg brings the score to {found.score_corrected:.2f} from {scores} ({seen}, "
-        f"{np.degrees(found.halves_rad):.2f} deg){_place(found)}; a place that is {1e3 * alike:.0f} mm off would look alike "
-        f"at {found.depth_m:.1f} m, where the edges are"
+        f"{np.degrees(found.halves_rad):.2f} deg){_place(found)}; at {found.depth_m:.1f} m, where the edges "
+        f"are, a place that is {1e3 * alike:.0f} mm off would look alike"
     )
     return Check(_SPACE, False, detail, _turn(found, mounting))
 
