@@ -37,6 +37,9 @@ def recording_checks(recording: Path) -> list[Check]:
                 progress.update(done, SHOTS)
     except Unchecked as why:
         return [Check(_SPACE, True, f"nothing to check: {why}")]
+    if not views.views:
+        mend = "let both drivers stamp with one clock, and record them together"
+        return [Check(_TIME, False, "no depth image has a stamp within 0.1 s of that of a colour image", mend)]
     found = align(views)
     if found is None:
         detail = f"cannot tell: too few of {len(views.views)} frames have edges in depth that show in colour"

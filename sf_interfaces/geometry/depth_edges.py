@@ -21,6 +21,7 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
 
 _DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+_WIDTH = 640  # px; of a wider depth image, only every so many-th row and column are looked at
 _JUMP = 1.08  # what lies behind an edge is farther by this factor
 _BREAK = 1.06  # and the next pixel no continuation of the near surface
 _REACH = 15  # px, the widest gap (shadow) between near and far surface
@@ -74,7 +75,9 @@ def depth_edges(depth: DepthMap, camera: Camera) -> DepthEdges:
     Args:
         camera: of the depth image.
     """
+    every = max(1, round(camera.width / _WIDTH))
     z = np.where(depth.valid, depth.z, 0).astype(np.float32)  # 0: none; no filter, which would move borders of gaps
+    z = np.ascontiguousarray(z[every // 2 :: every, every // 2 :: every])
     inner = np.zeros(z.shape, bool)
     inner[_MARGIN:-_MARGIN, _MARGIN:-_MARGIN] = True
     points, outward = [], []
@@ -86,11 +89,11 @@ def depth_edges(depth: DepthMap, camera: Camera) -> DepthEdges:
         ends = (following <= 0) | (following > _BREAK * z)
         flat = (nearest > (1 - _FLAT) * z) & (farthest < (1 + _FLAT) * z)
         row, column = np.nonzero(inner & (z > 0) & ends & (behind > _JUMP * z) & flat)
-        pixels = np.stack([column, row], axis=1) + 0.5 + 0.5 * np.array(direction)
+        pixels = every * (np.stack([column, row], axis=1) + 0.5 * np.array(direction)) + every // 2 + 0.5
         points.append(camera.unproject(pixels, z[row, column].astype(np.float64)))
         outward.append(np.tile((*direction, 0.0), (len(row), 1)))
-    every = -(-sum(map(len, points)) // _MOST) or 1
-    return DepthEdges(np.concatenate(points)[::every], np.concatenate(outward)[::every])
+    step = -(-sum(map(len, points)) // _MOST) or 1
+    return DepthEdges(np.concatenate(points)[::step], np.concatenate(outward)[::step])
 
 
 def _line(direction: tuple[int, int], length: int) -> dict[str, Any]:

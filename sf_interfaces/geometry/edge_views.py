@@ -15,6 +15,7 @@ from sf_interfaces.geometry.depth_edges import DepthEdges, Gradients, depth_edge
 from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
 
 WIDTH = 640  # px; wider images are reduced to it
+_LONGEST_S = 1.0  # between the images before and after; over more time no motion can be followed
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class EdgeView:
         stamp_ns: of the colour image.
         edges: of the depth image.
         gradients: of the colour image.
-        flow: [N, 2] px/s, how the edges move in the colour image.
+        flow: [N, 2] px/s, how the edges move in the colour image; 0 where that cannot be followed.
         ahead: s, from the stamp of the depth image to that of the colour image.
         period: s, between colour images.
     """
@@ -76,7 +77,9 @@ class EdgeViews:
         before, at, after = (self._grey(image) for image in shot.images)
         uv, _ = seen(edges, self.camera, self.T_color_depth)
         seconds = (shot.stamps_ns[2] - shot.stamps_ns[0]) * 1e-9
-        flow = (self._motion(at, after, uv) - self._motion(at, before, uv)) / seconds
+        flow = np.zeros_like(uv)
+        if seconds < _LONGEST_S:
+            flow = (self._motion(at, after, uv) - self._motion(at, before, uv)) / seconds
         ahead = (shot.stamps_ns[1] - shot.depth_ns) * 1e-9
         self.views.append(EdgeView(shot.stamps_ns[1], edges, gradients(at), flow, ahead, seconds / 2))
 

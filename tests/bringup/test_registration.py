@@ -68,6 +68,8 @@ def test_edges_are_the_ends_of_near_surfaces_and_found_in_the_image() -> None:
     uv, axis = seen(edges, camera, np.eye(4))
     assert np.allclose(edges.points[:, 2], 1.5)
     assert set(np.round(uv[axis == 0, 0])) == {50, 100} and set(np.round(uv[axis == 1, 1])) == {40, 90}
+    wide = depth_edges(DepthMap(np.kron(z, np.ones((8, 8)))), camera.scaled(8.0))
+    assert np.abs(np.sort(np.unique(seen(wide, camera, np.eye(4))[0][:, 0]))[[0, -1]] - (50, 100)).max() < 0.3
     image = np.random.default_rng(0).integers(60, 100, (120, 160)).astype(np.uint8)
     image[44:94, 47:97] += 60
     shift = best_shift(scores_of_shifts(uv, axis, gradients(image), 10))
@@ -164,6 +166,9 @@ def test_doctor_says_where_there_is_nothing_to_check(
     assert cli.main(["doctor", str(tmp_path / "rgb.mcap")]) == 0
     assert "nothing to check: no depth images" in capsys.readouterr().out
     assert cli.main(["doctor", str(tmp_path / "none.mcap")]) == 2
+    late = [replace(shot, depth_ns=shot.depth_ns + 10**10) for shot in shots]
+    (apart,) = recording_checks(write(tmp_path / "late.mcap", rig, late, np.eye(4), register=True))
+    assert not apart.ok and "within 0.1 s" in apart.detail
     with SequenceWriter(tmp_path / "own.mcap") as writer:
         writer.camera_info(INFO, 1, rig.color)
         writer.image(COLOR, 1, shots[0].images[0], rig.color.frame_id)
