@@ -23,7 +23,7 @@ from sf_interfaces.io.datasets.files import read_depth, read_rgb
 from sf_interfaces.io.datasets.indoor import SevenScenes, stamp_30hz
 from sf_interfaces.types import Camera, DepthMap, Float32, Float64
 
-# What came with the recording of 7-Scenes, before its registration was measured.
+# What was used for 7-Scenes before its registration was measured: the pose of another Kinect.
 GIVEN = se3.orthonormalise(
     np.array(
         [

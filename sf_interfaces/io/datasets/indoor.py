@@ -43,7 +43,7 @@ class SevenScenes(Dataset):
     """Microsoft 7-Scenes (Kinect v1).
 
     Depth is the depth camera's (f 585); it is registered into the colour camera (f 525). The poses are the
-    depth camera's and are carried over to the colour camera. No calibration between the two was published: the
+    depth camera's and are carried over to the colour camera. The files bring no calibration between the two: the
     rotation of ``T_COLOR_DEPTH`` is what lays depth edges onto those of colour in frames 0-99 of RedKitchen
     (:mod:`sf_interfaces.geometry.depth_alignment`), the translation is that of the sensor's make.
     """
