@@ -11,7 +11,7 @@ from sf_bringup.doctor import Check
 from sf_bringup.progress import Progress
 from sf_bringup.recorded_shots import Mounting, Unchecked, recorded_shots
 from sf_interfaces.geometry import se3
-from sf_interfaces.geometry.depth_alignment import Alignment, align
+from sf_interfaces.geometry.depth_alignment import FEW_EDGES, FEW_FRAMES, REACH, Alignment, align
 from sf_interfaces.geometry.edge_views import EdgeViews
 from sf_interfaces.types import Float64
 
@@ -40,12 +40,25 @@ def recording_checks(recording: Path) -> list[Check]:
     if not views.views:
         mend = "let both drivers stamp with one clock, and record them together"
         return [Check(_TIME, False, "no depth image has a stamp within 0.1 s of that of a colour image", mend)]
+    return judge(views, mounting)
+
+
+def judge(views: EdgeViews, mounting: Mounting) -> list[Check]:
+    """What the edges of some tens of shots tell."""
     found = align(views)
     if found is None:
-        detail = f"cannot tell: too few of {len(views.views)} frames have edges in depth that show in colour"
-        return [Check(_SPACE, True, detail, "record some tens of frames with near and far things in view")]
+        return [_not_told(views)]
     start_ns = views.views[0].stamp_ns
     return [_space(found, mounting), _time(found, mounting), *_lost(found, start_ns)]
+
+
+def _not_told(views: EdgeViews) -> Check:
+    """Too few frames have a clear shift: for want of edges, or because it is larger than what is tried."""
+    edges, reach = float(np.median([len(v.edges) for v in views.views])), REACH * views.camera.width * views.enlarged
+    detail = f"cannot tell: of {len(views.views)} frames, too few have edges in depth that show in colour"
+    if len(views.views) >= FEW_FRAMES and edges >= FEW_EDGES:
+        detail += f" within {reach:.0f} px, though depth has them: they do not belong together, or lie farther apart"
+    return Check(_SPACE, True, detail, "record some tens of frames with near and far things in view")
 
 
 def _space(found: Alignment, mounting: Mounting) -> Check:
@@ -53,30 +66,23 @@ def _space(found: Alignment, mounting: Mounting) -> Check:
     seen = f"{found.used} of {found.frames} frames, halves agree to {found.halves_px:.1f} px"
     scores = f"{found.score:.2f}, by chance {found.score_chance:.2f}"
     if found.off_px <= limit and found.halves_px <= 2 * limit:
-        return Check(
-            _SPACE, True, f"its edges lie within {found.off_px:.1f} px ({seen}; score {scores}){_place(found)}"
-        )
+        return Check(_SPACE, True, f"its edges lie within {found.off_px:.1f} px ({seen}; score {scores})")
     if not found.confirmed or found.off_px < _SURE * found.halves_px:
         detail = f"cannot tell: {found.off_px:.1f} px off, but {seen}"
         return Check(_SPACE, True, detail, "record more frames, with near and far things all over the image")
     right, down = found.offset_px
-    degrees = np.degrees(np.linalg.norm(found.rotation))
-    alike = found.off_px * found.depth_m / mounting.color.fx
-    detail = (
-        f"{found.off_px:.1f} px off: to lie on colour it has to move {right:+.1f} px right, {down:+.1f} px down; "
-        f"a turn of {degrees:.2f} deg brings the score to {found.score_corrected:.2f} from {scores} ({seen}, "
-        f"{np.degrees(found.halves_rad):.2f} deg){_place(found)}; at {found.depth_m:.1f} m, where the edges "
-        f"are, a place that is {1e3 * alike:.0f} mm off would look alike"
+    detail = f"{found.off_px:.1f} px off: to lie on colour it has to move {right:+.1f} px right, {down:+.1f} px down"
+    rest = float(np.nan_to_num(np.linalg.norm(found.near_far_px)))
+    if rest > max(2 * limit, _SURE * found.halves_px) or found.halves_px > 2 * limit:
+        detail += f", but no turn explains that: {seen}, near edges stay {rest:.1f} px off against far ones"
+        return Check(_SPACE, False, detail, "calibrate both cameras, lenses and place: it is not the direction alone")
+    alike = 1e3 * found.off_px * found.depth_m / mounting.color.fx
+    detail += (
+        f"; a turn of {np.degrees(np.linalg.norm(found.rotation)):.2f} deg brings the score to "
+        f"{found.score_corrected:.2f} from {scores} ({seen}, {np.degrees(found.halves_rad):.2f} deg); at "
+        f"{found.depth_m:.1f} m, where the edges are, a place that is {alike:.0f} mm off would look alike"
     )
     return Check(_SPACE, False, detail, _turn(found, mounting))
-
-
-def _place(found: Alignment) -> str:
-    """What a rotation does not explain."""
-    rest = float(np.linalg.norm(found.near_far_px))
-    if np.isfinite(rest) and rest > max(3.0, _SURE * found.halves_px):
-        return f"; near edges are {rest:.1f} px off against far ones, so the place or a focal length is wrong too"
-    return ""
 
 
 def _turn(found: Alignment, mounting: Mounting) -> str:
@@ -91,8 +97,8 @@ def _turn(found: Alignment, mounting: Mounting) -> str:
     t, q = se3.to_quaternion(found.corrected(mounting.T_color_depth))
     names = zip(("x", "y", "z", "qx", "qy", "qz", "qw"), (*t, *q), strict=True)
     pose = " ".join(f"--{name} {value:.6f}" for name, value in names)
-    frames = f"--frame-id {mounting.color.frame_id} --child-frame-id {mounting.depth.frame_id}"
-    return f"the pose that fits: ros2 run tf2_ros static_transform_publisher {pose} {frames}"
+    pose += f" --frame-id {mounting.color.frame_id} --child-frame-id {mounting.depth.frame_id}"
+    return f"the pose that fits, in place of that on /tf_static: ros2 run tf2_ros static_transform_publisher {pose}"
 
 
 def _numbers(values: Float64) -> str:

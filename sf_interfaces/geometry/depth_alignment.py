@@ -24,10 +24,10 @@ from sf_interfaces.geometry.depth_edges import Gradients, best_shift, scores_of_
 from sf_interfaces.geometry.edge_views import EdgeView, EdgeViews
 from sf_interfaces.types import Camera, Float64
 
-_RADIUS = 0.05  # of the image width, the largest shift that is found
-_FEW_EDGES = 150  # a depth image with fewer says nothing
+REACH = 0.05  # of the image width, the largest shift that is found
+FEW_EDGES = 150  # a depth image with fewer says nothing
 _CLEAR = 1.35  # clarity from which on the shift of one frame counts; without any relation it is 1.1 to 1.3
-_FEW_FRAMES = 10  # frames that count; with fewer nothing is said
+FEW_FRAMES = 10  # frames that count; with fewer nothing is said
 _NOISE_PX = 0.3  # deviation of the shift of a single frame
 _LOOSE_PX = 0.7  # shifts that are off the common line by more count less
 _LAG_TOLD_S = 0.004  # deviation of the lag from which on the motion was too little
@@ -105,7 +105,7 @@ def align(found: EdgeViews) -> Alignment | None:
         None where there are too few frames whose edges tell.
     """
     views, shifts = _telling(found.views, found.camera, found.T_color_depth)
-    if len(views) < _FEW_FRAMES:
+    if len(views) < FEW_FRAMES:
         return None
     camera, T = found.camera, found.T_color_depth
     flow = np.array([np.median(view.flow, axis=0) for view in views])  # [N, 2] px/s
@@ -116,7 +116,7 @@ def align(found: EdgeViews) -> Alignment | None:
     turned = everything.fit(max(start, start * (0, 0, 0, 1), key=everything.score), first.told)
     # A jump shows when what differs over the image, a roll above all, no longer blurs the shifts.
     kept, shifts = _telling(views, camera, _turned(turned) @ T)
-    jump = _jump(kept, shifts) if first.told and len(kept) >= _FEW_FRAMES else None
+    jump = _jump(kept, shifts) if first.told and len(kept) >= FEW_FRAMES else None
     if jump is not None:
         views = [replace(v, ahead=v.ahead + jump.seconds) if v.stamp_ns >= jump.before_ns else v for v in views]
     return _judged(found, views, turned, first.told, jump)
@@ -162,14 +162,14 @@ def _turned(p: Float64) -> Float64:
 
 
 def _radius(camera: Camera) -> int:
-    return round(_RADIUS * camera.width)
+    return round(REACH * camera.width)
 
 
 def _telling(views: Sequence[EdgeView], camera: Camera, T_color_depth: Float64) -> tuple[list[EdgeView], Float64]:
     """The views of which it is clear how far they are off, and these shifts, [N, 2] px."""
     kept, shifts = [], []
     for view in views:
-        if len(view.edges) < _FEW_EDGES:
+        if len(view.edges) < FEW_EDGES:
             continue
         uv, axis = seen(view.edges, camera, T_color_depth)
         shift = best_shift(scores_of_shifts(uv + view.ahead * view.flow, axis, view.gradients, _radius(camera)))

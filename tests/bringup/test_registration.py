@@ -14,12 +14,14 @@ import numpy as np
 import pytest
 
 from sf_bringup import cli, doctor_recording
-from sf_bringup.doctor_recording import recording_checks
+from sf_bringup.doctor import Check
+from sf_bringup.doctor_recording import judge, recording_checks
+from sf_bringup.recorded_shots import Mounting
 from sf_bringup.simulate import SimulationSpec
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.depth_alignment import Alignment
 from sf_interfaces.geometry.depth_edges import best_shift, depth_edges, gradients, scores_of_shifts, seen
-from sf_interfaces.geometry.edge_views import Shot
+from sf_interfaces.geometry.edge_views import EdgeViews, Shot
 from sf_interfaces.geometry.registration import register_depth
 from sf_interfaces.io.datasets.indoor import SevenScenes
 from sf_interfaces.io.sequence_writer import SequenceWriter
@@ -113,6 +115,25 @@ def test_without_structure_or_relation_nothing_is_told(rig: registration.Rig, sh
     mixed = [replace(shot, images=tuple(image[::-1] for image in shot.images)) for shot in mixed]
     a = registration.found(mixed, rig.depth, rig.color, rig.T_color_depth)
     assert a is None or not a.confirmed or a.off_px < 1.5 * a.halves_px
+
+
+def told(rig: registration.Rig, shots: list[Shot], claimed: Float64) -> Check:
+    """What the doctor says in space."""
+    mounting = Mounting(rig.color, rig.depth, claimed, False)
+    views = EdgeViews(rig.depth, rig.color, claimed)
+    for shot in shots:
+        views.add(shot)
+    return judge(views, mounting)[0]
+
+
+def test_what_no_turn_explains_gets_none(rig: registration.Rig, shots: list[Shot]) -> None:
+    aside = rig.T_color_depth.copy()
+    aside[0, 3] += 0.07
+    found = told(rig, shots, aside)
+    assert not found.ok and "no turn explains" in found.detail and "static_transform_publisher" not in found.mend
+    far = se3.exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(8.0), 0.0])) @ rig.T_color_depth
+    found = told(rig, shots, far)
+    assert "cannot tell" in found.detail and "within 16 px" in found.detail
 
 
 def write(path: Path, rig: registration.Rig, shots: list[Shot], claimed: Float64, register: bool) -> Path:
