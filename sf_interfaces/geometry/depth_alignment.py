@@ -162,7 +162,7 @@ def _turned(p: Float64) -> Float64:
 
 
 def _radius(camera: Camera) -> int:
-    return round(REACH * camera.width)
+    return min(round(REACH * camera.width), camera.height // 4)
 
 
 def _telling(views: Sequence[EdgeView], camera: Camera, T_color_depth: Float64) -> tuple[list[EdgeView], Float64]:
