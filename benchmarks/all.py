@@ -37,7 +37,7 @@ FOLDER = {
     "scales": ([], ["--frames", "400", "--factor", "1"]),
     "registration": (
         ["--scenes", "room0", "--frames", "16"],
-        ["--scenes", "room0", "office0", "lounge", "room", "hall", "office3", "--frames", "40"],
+        ["--scenes", "room0", "office0", "lounge", "room", "hall", "office3", "office1", "room1"],
     ),
     "real": ([], ["--frames", "1000", "--full"]),
 }

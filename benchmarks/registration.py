@@ -37,7 +37,16 @@ GIVEN = se3.orthonormalise(
 # Frames of 7-Scenes: all, and two parts before the lost depth image.
 PARTS = {"0-199": range(1, 199, 3), "0-99": range(1, 100, 2), "101-176": range(101, 177, 2)}
 # Scene -> lag, s.
-SCENES = {"room0": 0.012, "office0": 0.0, "lounge": 0.020, "room": 0.0, "hall": -0.010, "office3": 0.008}
+SCENES = {
+    "room0": 0.012,
+    "office0": 0.0,
+    "lounge": 0.020,
+    "room": 0.0,
+    "hall": -0.010,
+    "office3": 0.008,
+    "office1": 0.015,
+    "room1": -0.006,
+}
 QUICK_SCENES = ("room0", "lounge")
 # Rotations by which the claimed pose of a simulated depth camera is wrong, deg about its x, y and z.
 ERRORS_DEG = ((0.0, 0.0, 0.0), (0.3, -0.6, 0.5), (-1.0, 0.4, -0.8), (0.1, 0.1, 0.0))
