@@ -35,6 +35,10 @@ FOLDER = {
         ["--lost", "--memory", "10000"],
     ),
     "scales": ([], ["--frames", "400", "--factor", "1"]),
+    "registration": (
+        ["--scenes", "room0", "--frames", "16"],
+        ["--scenes", "room0", "office0", "lounge", "room", "hall", "office3", "office1", "room1"],
+    ),
     "real": ([], ["--frames", "1000", "--full"]),
 }
 # Those that write one file, by --out FILE.
@@ -45,7 +49,7 @@ FILE = {
     "completion": ([], []),
 }
 NEED_DATA = ("real", "completion", "live_map", "colour")
-USE_DATA = (*NEED_DATA, "depth")
+USE_DATA = (*NEED_DATA, "depth", "registration")
 
 
 def commands(full: bool, data: Path | None, out: Path) -> dict[str, list[str]]:

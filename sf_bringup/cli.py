@@ -146,7 +146,7 @@ def _blocks(args: argparse.Namespace) -> int:
 def _doctor(args: argparse.Namespace) -> int:
     from sf_bringup.doctor import checks
 
-    rows = checks(args.seconds)
+    rows = checks(args.seconds, args.recording)
     value = [{"check": c.name, "ok": c.ok, "detail": c.detail, "mend": c.mend} for c in rows]
     lines = [f"{'ok  ' if c.ok else 'FAIL'} {c.name}: {c.detail}{f'; {c.mend}' if c.mend else ''}" for c in rows]
     _print(value, args.json, "\n".join(lines))
@@ -295,7 +295,8 @@ def build_parser() -> argparse.ArgumentParser:
     add_arguments(p)
 
     verb("blocks", _blocks, "list the installed blocks")
-    p = verb("doctor", _doctor, "check the installation, the machine and the live topics")
+    p = verb("doctor", _doctor, "check the installation, the machine and the live topics, or a recording")
+    p.add_argument("recording", nargs="?", type=Path, help="bag or data set: does its depth lie on its colour?")
     p.add_argument("--seconds", type=float, default=3.0, help="listen to live topics this long (0: not at all)")
     p = verb("demo", _demo, "simulate, play, record, measure: the whole system in one command")
     p.add_argument("--out", type=Path, default=Path("demo"))

@@ -1,4 +1,7 @@
-"""``sf doctor``: is everything there that the lines need, can processes talk, and what do the topics say?"""
+"""``sf doctor``: is everything there that the lines need, can processes talk, and what do the topics say?
+
+With a recording: does its depth lie on its colour?
+"""
 
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
@@ -119,12 +122,20 @@ def _middleware() -> Check:
     return Check("middleware", True, f"{name}, domain {domain}, discovery {reach}")
 
 
-def checks(seconds: float = 3.0) -> list[Check]:
+def checks(seconds: float = 3.0, recording: Path | None = None) -> list[Check]:
     """All findings, in the order in which problems should be mended.
 
     Args:
         seconds: how long to listen to the live topics; 0: not at all.
+        recording: look at this bag or data set instead of the machine.
+
+    Raises:
+        SceneFactoryError: the recording cannot be read.
     """
+    if recording is not None:
+        from sf_bringup.doctor_recording import recording_checks
+
+        return recording_checks(recording)
     tests = [
         _versions,
         _import("sf_interfaces.msg"),

@@ -44,7 +44,9 @@ class SevenScenes(Dataset):
     """Microsoft 7-Scenes (Kinect v1).
 
     Depth is the depth camera's (f 585); it is registered into the colour camera (f 525). The poses are the
-    depth camera's and are carried over to the colour camera.
+    depth camera's and are carried over to the colour camera. The files bring no calibration between the two: the
+    rotation of ``T_COLOR_DEPTH`` is what lays depth edges onto those of colour in frames 0-99 of RedKitchen
+    (:mod:`sf_interfaces.geometry.depth_alignment`), the translation is that of the sensor's make.
     """
 
     register: bool = True
@@ -100,7 +102,10 @@ class SevenScenes(Dataset):
         return Sample(stamp_30hz(number_of(file)), file, read_rgb(file), camera, lens, depth=depth, pose=T)
 
     def notes(self) -> Sequence[str]:
-        return ("depth is registered to the colour camera (f 525); times are nominal, 30 Hz",)
+        return (
+            "depth is registered to the colour camera (f 525) with a rotation measured on RedKitchen, another sensor "
+            "may differ: sf doctor tells; times are nominal, 30 Hz",
+        )
 
 
 @dataclass(frozen=True)
