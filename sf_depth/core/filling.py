@@ -14,7 +14,7 @@ import numpy as np
 
 from sf_depth.config import DepthConfig
 from sf_depth.core.conditioning import coarse_slopes
-from sf_depth.core.diffusion import CHANNELS, Diffusion
+from sf_depth.core.diffusion import CHANNELS, Diffusion, spread
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.monodepth import MonoDepth, load_monodepth
 from sf_depth.core.parallel import one_torch_thread
@@ -78,10 +78,9 @@ def _filled(image: np.ndarray, seen: DepthMap) -> tuple[Float32, Float32]:
     support = supports(image, d, seen.valid)
     d = np.where(support, d, np.float32(0))
     relative = np.where(support, seen.variance * d * d, 0.0).astype(np.float32)
-    diffusion = Diffusion(image, support)
-    slope = diffusion.fill(_slopes(d, support), _REACH * width)[..., :2]
+    slope = spread(image, _slopes(d, support), support, _REACH * width)[..., :2]
     along, level, square, known = np.moveaxis(
-        diffusion.fill(np.stack([d, d, d * d, relative], axis=2), slope=slope), 2, 0
+        Diffusion(image, support).fill(np.stack([d, d, d * d, relative], axis=2), slope=slope), 2, 0
     )
     low, high = np.quantile(d[support], [0.01, 0.99])
     along, level = (np.clip(part, low / _FARTHEST, high * _FARTHEST) for part in (along, level))

@@ -12,13 +12,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sf_depth.core.diffusion import CHANNELS, Diffusion
+from sf_depth.core.diffusion import CHANNELS, spread
 from sf_interfaces.types import Float32, UInt8
 
 _RIM = 1 / 80  # image widths: half a window
 _ALONE = 2.0  # rims away from anything further inside, what is kept counts too: nothing else tells about it
 _ALIKE = 0.1  # relative difference of inverse depth that the slope of one surface makes within a rim
-_REDUCTION = 2  # the check needs no fine image
 _LEAST = 0.25  # share of what is kept that is left without its outermost pixels; less is no surface
 
 
@@ -35,21 +34,10 @@ def supports(image: UInt8, d: Float32, valid: np.ndarray) -> np.ndarray:
     rim = _RIM * valid.shape[1]
     deep = _distance(valid) > rim
     trusted = deep | (inner & (_distance(~deep) > _ALONE * rim))
-    if not trusted[_REDUCTION // 2 :: _REDUCTION, _REDUCTION // 2 :: _REDUCTION].any():
-        return inner
-    expected = _spread(image, np.where(trusted, d, np.float32(0)), trusted)
+    expected = spread(image, np.repeat(d[..., None], CHANNELS, axis=2), trusted)[..., 0]
     return np.asarray(trusted | (inner & (np.abs(expected - d) < _ALIKE * expected)))
 
 
 def _distance(mask: np.ndarray) -> Float32:
     """Distance of every pixel of a mask to the nearest one that is none, px [H, W]."""
     return np.asarray(cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3))
-
-
-def _spread(image: UInt8, d: Float32, known: np.ndarray) -> Float32:
-    """Inverse depth [H, W] that diffuses from the known pixels [H, W] bool."""
-    size = (known.shape[1] // _REDUCTION, known.shape[0] // _REDUCTION)
-    some = np.s_[_REDUCTION // 2 :: _REDUCTION, _REDUCTION // 2 :: _REDUCTION]
-    diffusion = Diffusion(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.ascontiguousarray(known[some]))
-    spread = diffusion.fill(np.repeat(d[some][..., None], CHANNELS, axis=2))[..., 0]
-    return np.asarray(cv2.resize(spread, known.shape[::-1], interpolation=cv2.INTER_NEAREST))

@@ -50,6 +50,15 @@ def test_supports_lie_inside_of_what_is_kept_and_hold_all_that_is_well_inside() 
     assert support[2:22, 2:-2].all()  # the wall: its rim looks like the gap and has its depth
 
 
+def test_thin_surfaces_support_all_but_their_outermost_pixels() -> None:
+    valid = np.zeros((HEIGHT, WIDTH), bool)
+    valid[30:35], valid[100:105] = True, True  # narrower than two rims
+    d = np.full(valid.shape, 0.5, np.float32)
+    inner = np.zeros_like(valid)
+    inner[31:34], inner[101:104] = True, True
+    np.testing.assert_array_equal(supports(np.full((HEIGHT, WIDTH), 120, np.uint8), d, valid), inner)
+
+
 @pytest.mark.parametrize("pixels", [1, 40])
 def test_what_is_no_surface_supports_as_it_is(pixels: int) -> None:
     valid = np.zeros((HEIGHT, WIDTH), bool)
