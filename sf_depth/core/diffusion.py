@@ -22,6 +22,7 @@ _EDGE = 0.008  # difference of Lab colours (0..1) from pixel to pixel at which a
 _LEAST = 1e-6  # conductance across the hardest edge
 _STEPS = 20  # of conjugate gradients at every level
 _COARSEST = 4  # px, a side of the coarsest level at least
+_SPREAD = 320  # px, the width that is enough for what is smooth
 _COLUMNS, _ROWS = (np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])  # the two ends of every link
 
 
@@ -121,6 +122,21 @@ class Diffusion:
                     step = slope[..., axis]
                     inflow[here][..., 0] += np.float32(0.5 * sign) * w * (step[here] + step[there])
         return np.pad(ground, self._pad), np.pad(inflow, (*self._pad, (0, 0)))
+
+
+def spread(image: UInt8, values: Float32, known: np.ndarray, reach: float = np.inf) -> Float32:
+    """Images without gaps [H, W, 4], smooth ones: diffused at a fraction of the size where that is large.
+
+    Args:
+        image, known: as those of :class:`Diffusion`; only every n-th known pixel of every n-th row counts.
+        values, reach: as those of :meth:`Diffusion.fill`.
+    """
+    height, width = known.shape
+    n = max(1, width // _SPREAD)
+    size, some = (width // n, height // n), tuple(slice(n // 2, side // n * n, n) for side in known.shape)
+    small = Diffusion(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.ascontiguousarray(known[some]))
+    filled = small.fill(np.ascontiguousarray(values[some]), reach / n)
+    return np.asarray(cv2.resize(filled, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
 def _follow(inflow: Float32, links: Links, slope: Float32) -> None:

@@ -14,11 +14,12 @@ import numpy as np
 
 from sf_depth.config import DepthConfig
 from sf_depth.core.conditioning import coarse_slopes
-from sf_depth.core.diffusion import CHANNELS, Diffusion
+from sf_depth.core.diffusion import CHANNELS, Diffusion, spread
 from sf_depth.core.estimator import DepthCompleter
 from sf_depth.core.monodepth import MonoDepth, load_monodepth
 from sf_depth.core.parallel import one_torch_thread
 from sf_depth.core.scalecov import MIN_OBSERVATIONS
+from sf_depth.core.supports import supports
 from sf_interfaces.errors import FormatError
 from sf_interfaces.types import DepthMap, Float32, Keyframe
 
@@ -72,13 +73,14 @@ class Filler:
 def _filled(image: np.ndarray, seen: DepthMap) -> tuple[Float32, Float32]:
     """Depth and variance without gaps, [H, W] each."""
     assert seen.variance is not None
-    width, support = image.shape[1], _support(seen.valid)
-    d = np.where(support, 1.0 / np.where(support, seen.z, 1.0), 0.0).astype(np.float32)
+    width = image.shape[1]
+    d = np.where(seen.valid, 1.0 / np.where(seen.valid, seen.z, 1.0), 0.0).astype(np.float32)
+    support = supports(image, d, seen.valid)
+    d = np.where(support, d, np.float32(0))
     relative = np.where(support, seen.variance * d * d, 0.0).astype(np.float32)
-    diffusion = Diffusion(image, support)
-    slope = diffusion.fill(_slopes(d, support), _REACH * width)[..., :2]
+    slope = spread(image, _slopes(d, support), support, _REACH * width)[..., :2]
     along, level, square, known = np.moveaxis(
-        diffusion.fill(np.stack([d, d, d * d, relative], axis=2), slope=slope), 2, 0
+        Diffusion(image, support).fill(np.stack([d, d, d * d, relative], axis=2), slope=slope), 2, 0
     )
     low, high = np.quantile(d[support], [0.01, 0.99])
     along, level = (np.clip(part, low / _FARTHEST, high * _FARTHEST) for part in (along, level))
@@ -88,12 +90,6 @@ def _filled(image: np.ndarray, seen: DepthMap) -> tuple[Float32, Float32]:
     unsure += _SEEN * known + (_AWAY * away) ** 2
     z = np.where(seen.valid, seen.z, 1.0 / along)
     return z, np.where(seen.valid, seen.variance, unsure * z * z)
-
-
-def _support(valid: np.ndarray) -> np.ndarray:
-    """What gaps are filled from, [H, W] bool: their rims are the least sure, and left out where more is known."""
-    inner = cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    return inner if 4 * inner.sum() > valid.sum() else valid
 
 
 def _slopes(d: Float32, support: np.ndarray) -> Float32:

@@ -11,7 +11,7 @@ from sf_bringup.simulate.simulator import Simulator
 from sf_bringup.simulate.spec import SimulationSpec
 from sf_depth.config import DepthConfig
 from sf_depth.core import diffusion_reference as reference
-from sf_depth.core.diffusion import Diffusion
+from sf_depth.core.diffusion import Diffusion, spread
 from sf_depth.core.filling import Filler
 from sf_interfaces.errors import FormatError
 from sf_interfaces.native import kernels
@@ -26,6 +26,18 @@ def filled(image: np.ndarray, z: np.ndarray, camera: Camera = CAMERA) -> DepthMa
     depth = Filler(DepthConfig()).fill(Keyframe(0, camera, image, np.eye(4), seen)).depth
     assert depth is not None and depth.variance is not None
     return depth
+
+
+def test_on_a_large_image_what_is_smooth_spreads_alike_at_half_the_size() -> None:
+    known = np.ones((480, 650), bool)
+    known[160:320, 200:440] = False
+    row, col = np.mgrid[:480, :650].astype(np.float32)
+    values = np.stack([row, col, row + col, np.full_like(row, 100)], axis=2) / 400
+    values[~known] = 0.0
+    image = np.full(known.shape, 120, np.uint8)
+    got, full = spread(image, values, known, 192.0), Diffusion(image, known).fill(values, 192.0)
+    np.testing.assert_allclose(got, full, atol=0.02)
+    assert np.isfinite(spread(image, values, np.zeros_like(known), 192.0)).all()
 
 
 def disc(col: int, row: int, radius: int) -> np.ndarray:
