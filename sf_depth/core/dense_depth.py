@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 
 from sf_depth.core import pinhole
-from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
+from sf_depth.core.dense_ba import Estimate, Observations
+from sf_depth.core.posterior import Adjusted
 from sf_interfaces.types import Float32, Float64
 
 _ROUNDS = 4  # of reweighting

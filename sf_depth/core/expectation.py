@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 
 from sf_depth.core import pinhole
-from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
+from sf_depth.core.dense_ba import Estimate, Observations
 from sf_depth.core.matching import pixel_grid
 from sf_depth.core.parallel import each
 from sf_depth.core.plane_sweep import sweep_planes
+from sf_depth.core.posterior import Adjusted
 from sf_interfaces.types import Float32, Float64, UInt8
 
 _AGREE = 0.08  # relative difference up to which triangulated and swept inverse depth show one surface

@@ -1,7 +1,7 @@
 """An unknown focal length that the views hardly tell is drawn to what cameras usually have.
 
 Views with little parallax, of a plane, or whose errors are alike all over the image leave the focal length open: one
-that is far off fits as well. The posterior of dense bundle adjustment says so (``dense_ba.with_covariance``). With a
+that is far off fits as well. The posterior of dense bundle adjustment says so (``posterior.with_covariance``). With a
 prior on its logarithm, both count by what they know; a focal length that is well determined is left as it is.
 """
 

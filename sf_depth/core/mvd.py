@@ -15,13 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sf_depth.config import DepthConfig
-from sf_depth.core import checks, dense_ba, dense_depth, focal, pinhole
-from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
+from sf_depth.core import checks, dense_ba, dense_depth, focal, pinhole, posterior
+from sf_depth.core.dense_ba import Estimate, Observations
 from sf_depth.core.expectation import expected
 from sf_depth.core.matched import Matched, matched, thinned
 from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
 from sf_depth.core.outliers import lonely
 from sf_depth.core.parallel import each, one_blas_thread
+from sf_depth.core.posterior import Adjusted
 from sf_depth.core.scale import from_translations
 from sf_depth.core.start import Size, start, triangulate
 from sf_interfaces.errors import FormatError, InsufficientParallax
@@ -35,10 +36,10 @@ _LENS = 0.01  # share of the cost that a radial term beside a focal length has t
 _SURE = 0.01  # deviation of an unknown focal length; less sure, it and the radial term make up for each other
 _LENS_THINNING = 3  # every n-th of the pixels of dense BA tells whether there is a lens
 _BENDS = 0.5  # px at a width of 640; a lens that moves the corners of the image by less is none
-# Prior deviation of what sources turn by while they are read, and the share of the cost that it has to explain beside
-# known and unknown intrinsics: of a camera that reads at once and errs alike all over its image, and of one that reads
-# row by row. Simulated images reach 0.01, photo sets 0.25: an unknown focal length and turns make up for each other.
-_TURNS = ((0.0007, 0.12, 0.12), (0.004, 0.12, 0.27))
+# Prior deviation of what sources turn by while they are read, and the share of the cost that it has to explain: of a
+# camera that reads at once and errs alike all over its image, and of one that reads row by row. On simulated images it
+# is 0.01 at most, on photo sets 0.23.
+_TURNS = ((0.0007, 0.12), (0.004, 0.25))
 _REGISTERED = 60  # strided correspondences a source keeps if it is registered
 _BLOCK = 1 << 15  # pixels solved at once: their arrays stay in the cache
 CONTRADICTED = "given poses contradict the images: refined, they only give the scale, and the variance tells how well"
@@ -191,33 +192,35 @@ class MultiViewDepth:
             found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
             at = found.estimate
             steady = found.cost
-            for deviation, known, unknown in _TURNS if turn and last else ():
+            for deviation, share in _TURNS if turn and last else ():
                 turned = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, turn=deviation)
-                share = known if intrinsics in ("none", "lens") else unknown
                 found = turned if turned.cost < (1.0 - share) * steady else found
-        return _Fit(dense_ba.with_covariance(good, found, poses, intrinsics), good)
+        return _Fit(posterior.with_covariance(good, found, poses, intrinsics), good)
 
     def _with_lens_and_turns(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
-        """The fit with what cameras add to a pinhole: a radial term, and turns while their rows are read.
+        """The fit with what cameras add to a pinhole: a radial term, and turns while their rows are read."""
+        at, moved = fit.adjusted.estimate, 0.0
+        if self._lens and free == "none":
+            free = "lens"
+        elif self._lens and free == "f" and (told := self._beside_focal(fit)):
+            (at, moved), free = told, "radial"
+        fit = self._check_and_adjust(seen, at, size, True, free, True)
+        return replace(fit, focal_deviation=float(np.hypot(fit.unsure, moved))) if moved else fit
 
-        Beside an unknown focal length a radial term is free only where the views tell both; as the two make up for
-        each other, what it moves the focal length by counts as unsure in that, in the share of the cost that it leaves.
+    def _beside_focal(self, fit: _Fit) -> tuple[Estimate, float] | None:
+        """The optimum with a radial term beside an unknown focal length, None unless the views tell both.
+
+        As the two make up for each other, what the term moves the focal length by counts as unsure in that, in the
+        share of the cost that it leaves.
         """
-        bent = "lens" if self._lens and free == "none" else free
-        fit = self._check_and_adjust(seen, fit.adjusted.estimate, size, True, bent, True)
-        if not self._lens or free != "f":
-            return fit
         few, at = thinned(fit.seen, fit.adjusted.estimate, _LENS_THINNING)
-        turn = 0.0 if at.turn is None else at.turn_deviation
-        straight = dense_ba.optimum(few, at, intrinsics=free, turn=turn)
-        found = dense_ba.optimum(few, straight.estimate, intrinsics="radial", turn=turn)
-        deviation = dense_depth.focal_deviation(dense_ba.with_covariance(few, found, True, "radial"))
+        straight = dense_ba.optimum(few, at, intrinsics="f")
+        found = dense_ba.optimum(few, straight.estimate, intrinsics="radial")
+        deviation = dense_depth.focal_deviation(posterior.with_covariance(few, found, True, "radial"))
         if found.cost > (1.0 - _LENS) * straight.cost or deviation > _SURE:
-            return fit
-        at = replace(found.estimate, inverse_depth=fit.adjusted.estimate.inverse_depth)
-        lens = self._check_and_adjust(seen, at, size, True, "radial", True)
-        moved = np.log(lens.adjusted.estimate.theta[0] / fit.adjusted.estimate.theta[0]) * found.cost / straight.cost
-        return replace(lens, focal_deviation=float(np.hypot(lens.unsure, moved)))
+            return None
+        moved = np.log(found.estimate.theta[0] / straight.estimate.theta[0]) * found.cost / straight.cost
+        return replace(found.estimate, inverse_depth=fit.adjusted.estimate.inverse_depth), float(moved)
 
     def _with_usual_focal(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
         """The fit with the focal length of usual cameras as far as the views do not tell it."""
@@ -258,7 +261,7 @@ class MultiViewDepth:
 def _scaled(free: _Fit, T: Float64) -> _Fit:
     """A fit with free poses, at the scale of given ones."""
     scale = from_translations(free.adjusted.estimate.T[:, :3, 3], T[:, :3, 3])
-    return _Fit(dense_ba.rescaled(free.adjusted, scale.factor), free.seen, scale.deviation, contradicted=True)
+    return _Fit(posterior.rescaled(free.adjusted, scale.factor), free.seen, scale.deviation, contradicted=True)
 
 
 def check_images(images: Sequence[UInt8]) -> None:

@@ -11,9 +11,10 @@ import numpy as np
 
 from sf_bringup.simulate.render import Renderer
 from sf_bringup.simulate.scenes import SCENES
-from sf_depth.core import dense_ba
+from sf_depth.core import dense_ba, posterior
 from sf_depth.core import dense_ba_reference as reference
-from sf_depth.core.dense_ba import Adjusted, Estimate, Observations
+from sf_depth.core.dense_ba import Estimate, Observations
+from sf_depth.core.posterior import Adjusted
 from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, Float32, Float64, UInt8
 
@@ -83,4 +84,4 @@ __all__ = ["CAMERA", "Views", "exact", "room", "rotation_error_deg"]
 def adjust(seen: Observations, at: Estimate, poses: bool = True, intrinsics: str = "none", **options: Any) -> Adjusted:
     """The optimum with its covariance."""
     found = dense_ba.optimum(seen, at, poses=poses, intrinsics=intrinsics, **options)
-    return dense_ba.with_covariance(seen, found, poses, intrinsics)
+    return posterior.with_covariance(seen, found, poses, intrinsics)
