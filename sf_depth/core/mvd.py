@@ -190,8 +190,7 @@ class MultiViewDepth:
                 )
             good = Observations(seen.uv, seen.target, weight)
             found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
-            at = found.estimate
-            steady = found.cost
+            at, steady = found.estimate, found.cost
             for deviation, share in _TURNS if turn and last else ():
                 turned = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, turn=deviation)
                 found = turned if turned.cost < (1.0 - share) * steady else found
