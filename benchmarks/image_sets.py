@@ -22,7 +22,7 @@ from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.registration import register_depth
 from sf_interfaces.geometry.undistort import undistort_depth, undistort_image
 from sf_interfaces.io.datasets.indoor import SevenScenes
-from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float32, Float64, UInt8
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
 # Scene, seconds along its path, views, baseline over depth, largest roll deg. The first few serve a quick run; "ames"
@@ -141,16 +141,21 @@ def real(data: Path, everything: bool = True) -> Iterator[ImageSet]:
 
 def seven_scenes(folder: Path, sets: tuple[tuple[int, ...], ...]) -> Iterator[ImageSet]:
     """A hand-held Kinect; its depth is registered to colour, its poses are good to a degree or two."""
+    camera, lens = SevenScenes.COLOR_CAMERA, SevenScenes.LENS
     for frames in sets:
-        camera, lens = SevenScenes.COLOR_CAMERA, SevenScenes.LENS
         images = [undistort_image(_rgb(folder / f"frame-{k:06d}.color.jpg"), camera, lens) for k in frames]
-        motions = [_depth_to_color(folder, k) for k in frames]
-        poses = [_pose(folder, k) @ se3.inverse(T) for k, T in motions]
-        raw = cv2.imread(f"{folder}/frame-{motions[0][0]:06d}.depth.png", cv2.IMREAD_UNCHANGED)
-        measured = DepthMap(np.where((raw == 0) | (raw == 65535), np.nan, raw * 1e-3))
-        truth = register_depth(measured, SevenScenes.DEPTH_CAMERA, camera, motions[0][1])
-        truth = undistort_depth(truth, camera, lens)
+        poses = [registered_depth(folder, k)[1] for k in frames]
+        truth = undistort_depth(DepthMap(registered_depth(folder, frames[0])[0]), camera, lens)
         yield ImageSet(f"7-Scenes {frames[0]}, {len(frames)} views", camera, images, poses, truth)
+
+
+def registered_depth(folder: Path, frame: int) -> tuple[Float32, Float64]:
+    """Depth [H, W] m as a colour image of 7-Scenes saw it, lens and all, and T_map_camera of that."""
+    depth, T = _depth_to_color(folder, frame)
+    raw = cv2.imread(f"{folder}/frame-{depth:06d}.depth.png", cv2.IMREAD_UNCHANGED)
+    measured = DepthMap(np.where((raw == 0) | (raw == 65535), np.nan, raw * 1e-3))
+    z = register_depth(measured, SevenScenes.DEPTH_CAMERA, SevenScenes.COLOR_CAMERA, T).z
+    return z, _pose(folder, depth) @ se3.inverse(T)
 
 
 def _depth_to_color(folder: Path, frame: int) -> tuple[int, Float64]:
