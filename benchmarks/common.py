@@ -21,6 +21,7 @@ from sf_bringup.measures import reference_trajectory
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.runner import RunRequest, run, versions
 from sf_bringup.simulate import SimulationSpec, simulate
+from sf_interfaces.geometry.undistort import undistort_depth, undistort_image
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.sequence_writer import SequenceWriter
 from sf_interfaces.ros.messages import decode_camera_info, decode_depth, decode_image, to_ns
@@ -143,12 +144,12 @@ def load_frames(bag: Path) -> list[Frame]:
     """Colour and depth of a bag, joined by stamp, with the true poses."""
     images: dict[int, Any] = {}
     depths: dict[int, Any] = {}
-    camera = None
+    camera, lens = None, None
     with BagReader(bag) as reader:
         for raw in reader.messages([COLOUR, INFO, DEPTH]):
             message = reader.decode(raw)
             if raw.topic == INFO:
-                camera = camera or decode_camera_info(message)[0]
+                camera, lens = decode_camera_info(message)
             else:
                 store, decode = (images, decode_image) if raw.topic == COLOUR else (depths, decode_depth)
                 store[to_ns(message.header.stamp)] = decode(message)
@@ -156,7 +157,16 @@ def load_frames(bag: Path) -> list[Frame]:
     assert truth is not None and camera is not None
     poses = dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
     return [
-        Frame(s, camera, images[s], depths[s], None, poses[s]) for s in sorted(images) if s in depths and s in poses
+        Frame(
+            s,
+            camera,
+            undistort_image(images[s], camera, lens),
+            undistort_depth(depths[s], camera, lens),
+            None,
+            poses[s],
+        )
+        for s in sorted(images)
+        if s in depths and s in poses
     ]
 
 

@@ -29,6 +29,7 @@ from sf_bringup.evaluation.lpips import Lpips
 from sf_bringup.evaluation.mesh import icp
 from sf_bringup.evaluation.robust_mvd import mvd_error
 from sf_bringup.evaluation.seen_surface import seen_surface_error
+from sf_bringup.lenses import depth_decoder, image_decoder
 from sf_bringup.run_folder import RunFolder
 from sf_interfaces import topics
 from sf_interfaces.errors import FormatError
@@ -132,7 +133,8 @@ def depth_pairs(run: RunFolder, reference: Path | None = None) -> Iterator[tuple
     """(stamp, estimated, true depth) of keyframes that have both; ``reference``: a folder of <stamp>.npz or .png."""
     maps = dict(run.depth_maps())
     if reference is None:
-        truth = decoded(input_bag(run), GROUND_TRUTH_DEPTH, decode_depth, set(maps))
+        bag = input_bag(run)
+        truth = decoded(bag, GROUND_TRUTH_DEPTH, depth_decoder(run, bag), set(maps))
     else:
         files = files_by_name(reference, DEPTH_SUFFIXES)
         named = {int(name): path for name, path in files.items() if name.isdigit()}
@@ -305,7 +307,7 @@ def render_at(run: RunFolder, bag: Path, topic: str, pose_of: Mapping[int, Float
     if not run.map.is_file():
         return []
     field, camera, out = load_map(run.map), run.camera(), []
-    for stamp, image in decoded(bag, topic, decode_image, set(pose_of)):
+    for stamp, image in decoded(bag, topic, image_decoder(run, bag), set(pose_of)):
         view = field.render(camera, pose_of[stamp])
         real = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
         out.append(HeldOutView(stamp, view.image, real, view.depth.valid))

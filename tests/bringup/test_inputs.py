@@ -13,12 +13,15 @@ import pytest
 import yaml
 
 from sf_bringup.cli import main
+from sf_bringup.lenses import image_decoder
+from sf_bringup.run_folder import RunFolder
 from sf_bringup.runner import RunRequest, prepare
 from sf_interfaces.blocks import Quantity
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.calibration import read_camera
 from sf_interfaces.io.datasets import ReadOptions
+from sf_interfaces.ros.messages import decode_image
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.sync import SyncConfig
 from sf_interfaces.types import Frame
@@ -104,6 +107,21 @@ def test_a_given_calibration_takes_the_lens_out_once(model: str, tmp_path: Path)
         found = (patch * columns).sum() / patch.sum(), (patch * rows).sum() / patch.sum()
         np.testing.assert_allclose(found, (u, v), atol=0.35)  # the lens moved it by up to 7 px
     assert np.abs(distorted_pixels(model, POINTS)[inside] - straight[inside]).max() > 2
+
+
+def test_references_in_the_input_are_freed_from_the_lens_as_its_images_are(tmp_path: Path) -> None:
+    folder, run = tmp_path / "photos", RunFolder(tmp_path / "run")
+    for path in (folder, run.path):
+        path.mkdir()
+    cv2.imwrite(str(folder / "0.png"), photo(distorted_pixels("plumb_bob", POINTS)))
+    lens = calibration(tmp_path / "c.yaml", "plumb_bob")
+    given, _ = prepare(RunRequest((folder,), out=tmp_path / "out", calibration=lens))
+    (run.path / "run.json").write_text(json.dumps({"topics": dict(given.mapping.roles)}))
+    with BagReader(given.bag) as reader:
+        raw = reader.decode(next(iter(reader.messages(["/camera/color/image_raw"]))))
+    freed = image_decoder(run, given.bag)(raw)
+    np.testing.assert_array_equal(freed, frames(given.bag)[0].image)
+    assert (freed != decode_image(raw)).any()
 
 
 def test_a_calibration_of_another_size_or_model_is_refused(tmp_path: Path) -> None:
