@@ -41,7 +41,7 @@ def load(data: Path, frames: int, step: int) -> tuple[list[Keyframe], list[Keyfr
     """(keyframes, held-out frames) with registered depth, of a 7-Scenes folder or a simulated bag."""
     if data.is_dir():
         readers = list(islice(SevenScenes(data).samples(), frames))
-        samples = {i: readers[i]() for i in range(len(readers)) if i % step in (0, step // 2)}
+        samples = {i: readers[i]().undistorted() for i in range(len(readers)) if i % step in (0, step // 2)}
         made = {i: Keyframe(s.stamp_ns, s.camera, s.image, s.pose, s.depth) for i, s in samples.items()}
     else:
         every = enumerate(load_frames(data)[:frames])

@@ -21,9 +21,9 @@ from sf_interfaces.geometry.edge_views import Shot
 from sf_interfaces.geometry.undistort import Distortion, undistort_depth, undistort_image
 from sf_interfaces.io import datasets
 from sf_interfaces.io.bag import BagReader, RawMessage, is_bag
-from sf_interfaces.io.datasets import Dataset, Reader, Sample
+from sf_interfaces.io.datasets import Dataset, Reader
 from sf_interfaces.ros.messages import decode_camera_info, decode_depth, decode_image, to_ns
-from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float64
 
 _DEPTH_SLOP_NS = 100_000_000  # how far the stamp of a depth image may be from that of the colour image
 _KEPT = 20  # depth messages that wait for their colour image
@@ -83,18 +83,12 @@ def _of_dataset(dataset: Dataset, count: int) -> tuple[Mounting, Iterator[Shot]]
 
 def _dataset_shots(readers: list[Reader], chosen: list[int]) -> Iterator[Shot]:
     for k in chosen:
-        before, at, after = (readers[j]() for j in (k - 1, k, k + 1))
+        before, at, after = (readers[j]().undistorted() for j in (k - 1, k, k + 1))
         if at.depth is None or at.camera is None:
             continue
-        depth = undistort_depth(at.depth, at.camera, at.distortion)
         stamp = at.stamp_ns if at.depth_ns is None else at.depth_ns
         stamps = (before.stamp_ns, at.stamp_ns, after.stamp_ns)
-        yield Shot(stamps, (_plain(before), _plain(at), _plain(after)), depth, stamp)
-
-
-def _plain(sample: Sample) -> UInt8:
-    camera = sample.camera
-    return sample.image if camera is None else undistort_image(sample.image, camera, sample.distortion)
+        yield Shot(stamps, (before.image, at.image, after.image), at.depth, stamp)
 
 
 # ---- bags

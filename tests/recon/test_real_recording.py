@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sf_interfaces.geometry.undistort import undistort_depth, undistort_image
 from sf_interfaces.io.datasets.indoor import SevenScenes
 from sf_interfaces.types import Keyframe
 from sf_recon.config import ReconConfig
@@ -20,10 +19,9 @@ CAMERA = SevenScenes.COLOR_CAMERA
 
 def keyframe(folder: Path, index: int) -> Keyframe:
     """Frame with its depth registered to the colour camera."""
-    sample = list(SevenScenes(folder).samples())[index]()
+    sample = list(SevenScenes(folder).samples())[index]().undistorted()
     assert sample.depth is not None and sample.pose is not None
-    image = undistort_image(sample.image, CAMERA, sample.distortion)
-    return Keyframe(index, CAMERA, image, sample.pose, undistort_depth(sample.depth, CAMERA, sample.distortion))
+    return Keyframe(index, CAMERA, sample.image, sample.pose, sample.depth)
 
 
 def test_held_out_view_between_two_keyframes(shared_data: Callable[[str], Path]) -> None:

@@ -30,7 +30,7 @@ def folder(name: str) -> Path:
 def kitchen(root: Path, stride: int) -> Iterator[tuple[Frame, Float64]]:
     """Registered RGB-D frames and reference poses of the colour camera."""
     for read in islice(SevenScenes(root).samples(), None, None, stride):
-        sample = read()
+        sample = read().undistorted()
         assert sample.pose is not None
         yield Frame(sample.stamp_ns, sample.camera, sample.image, sample.depth), sample.pose
 

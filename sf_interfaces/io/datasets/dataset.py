@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
 
-from sf_interfaces.geometry.undistort import Distortion
+from sf_interfaces.geometry.undistort import Distortion, undistort_depth, undistort_image
 from sf_interfaces.types import Camera, DepthMap, Float32, Float64, PointCloud, UInt8
 
 OPTICAL, LIDAR, MAP = "camera_optical_frame", "lidar", "map"
@@ -50,6 +50,17 @@ class Sample:
     sweep_ns: int | None = None
     pose: Float64 | None = None
     reference_depth: DepthMap | None = None
+
+    def undistorted(self) -> Sample:
+        """The same as a pinhole sees it: image and depth without the lens."""
+        if self.camera is None or self.distortion is None:
+            return self
+        camera, lens = self.camera, self.distortion
+        depth, truth = (
+            None if z is None else undistort_depth(z, camera, lens) for z in (self.depth, self.reference_depth)
+        )
+        image = undistort_image(self.image, camera, lens)
+        return replace(self, image=image, distortion=None, depth=depth, reference_depth=truth)
 
 
 Reader = Callable[[], Sample]
