@@ -156,18 +156,11 @@ def load_frames(bag: Path) -> list[Frame]:
     truth = reference_trajectory(bag)
     assert truth is not None and camera is not None
     poses = dict(zip(truth.stamps_ns.tolist(), truth.poses, strict=True))
-    return [
-        Frame(
-            s,
-            camera,
-            undistort_image(images[s], camera, lens),
-            undistort_depth(depths[s], camera, lens),
-            None,
-            poses[s],
-        )
-        for s in sorted(images)
-        if s in depths and s in poses
-    ]
+    frames = []
+    for s in (s for s in sorted(images) if s in depths and s in poses):
+        image, depth = undistort_image(images[s], camera, lens), undistort_depth(depths[s], camera, lens)
+        frames.append(Frame(s, camera, image, depth, None, poses[s]))
+    return frames
 
 
 def mean_row(rows: Sequence[Mapping[str, Any]], **fixed: Any) -> dict[str, Any]:

@@ -21,8 +21,9 @@ from sf_bringup.simulate.render import Renderer
 from sf_interfaces.geometry import se3
 from sf_interfaces.geometry.registration import register_depth
 from sf_interfaces.geometry.undistort import undistort_depth, undistort_image
+from sf_interfaces.io.datasets.files import read_depth, read_pose
 from sf_interfaces.io.datasets.indoor import SevenScenes
-from sf_interfaces.types import Camera, DepthMap, Float32, Float64, UInt8
+from sf_interfaces.types import Camera, DepthMap, Float64, UInt8
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 320.0, 240.0)
 # Scene, seconds along its path, views, baseline over depth, largest roll deg. The first few serve a quick run; "ames"
@@ -144,30 +145,35 @@ def seven_scenes(folder: Path, sets: tuple[tuple[int, ...], ...]) -> Iterator[Im
     camera, lens = SevenScenes.COLOR_CAMERA, SevenScenes.LENS
     for frames in sets:
         images = [undistort_image(_rgb(folder / f"frame-{k:06d}.color.jpg"), camera, lens) for k in frames]
-        poses = [registered_depth(folder, k)[1] for k in frames]
-        truth = undistort_depth(DepthMap(registered_depth(folder, frames[0])[0]), camera, lens)
+        poses = [color_pose(folder, k) for k in frames]
+        truth = undistort_depth(registered_depth(folder, frames[0]), camera, lens)
         yield ImageSet(f"7-Scenes {frames[0]}, {len(frames)} views", camera, images, poses, truth)
 
 
-def registered_depth(folder: Path, frame: int) -> tuple[Float32, Float64]:
-    """Depth [H, W] m as a colour image of 7-Scenes saw it, lens and all, and T_map_camera of that."""
+def registered_depth(folder: Path, frame: int) -> DepthMap:
+    """Depth as a colour image of 7-Scenes saw it, lens and all."""
     depth, T = _depth_to_color(folder, frame)
-    raw = cv2.imread(f"{folder}/frame-{depth:06d}.depth.png", cv2.IMREAD_UNCHANGED)
-    measured = DepthMap(np.where((raw == 0) | (raw == 65535), np.nan, raw * 1e-3))
-    z = register_depth(measured, SevenScenes.DEPTH_CAMERA, SevenScenes.COLOR_CAMERA, T).z
-    return z, _pose(folder, depth) @ se3.inverse(T)
+    measured = read_depth(folder / f"frame-{depth:06d}.depth.png", SevenScenes.depth_units or 1000.0)
+    return register_depth(measured, SevenScenes.DEPTH_CAMERA, SevenScenes.COLOR_CAMERA, T)
+
+
+def color_pose(folder: Path, frame: int) -> Float64:
+    """T_map_camera of a colour image of 7-Scenes; the poses in the files are those of the depth camera."""
+    depth, T = _depth_to_color(folder, frame)
+    return _depth_pose(folder, depth) @ se3.inverse(T)
 
 
 def _depth_to_color(folder: Path, frame: int) -> tuple[int, Float64]:
     """The depth image taken with a colour image, and where its camera then was as seen from the colour camera."""
     depth = frame if frame < DEPTH_LOST else frame - 1
-    before, after = _pose(folder, max(depth - 1, 0)), _pose(folder, depth + 1)
-    motion = se3.log((se3.inverse(after) @ before)[None]) / (depth + 1 - max(depth - 1, 0))
+    first, last = max(depth - 1, 0), depth + 1
+    before, after = _depth_pose(folder, first), _depth_pose(folder, last)
+    motion = se3.log((se3.inverse(after) @ before)[None]) / (last - first)
     return depth, SevenScenes.T_COLOR_DEPTH @ se3.exp(DEPTH_LAG * motion)[0]
 
 
-def _pose(folder: Path, frame: int) -> Float64:
-    return se3.orthonormalise(np.loadtxt(folder / f"frame-{frame:06d}.pose.txt"))
+def _depth_pose(folder: Path, frame: int) -> Float64:
+    return read_pose(folder / f"frame-{frame:06d}.pose.txt")
 
 
 def fountain(folder: Path, factor: float = 0.5) -> ImageSet:

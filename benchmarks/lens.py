@@ -49,7 +49,7 @@ def pairs(folder: Path, references: range) -> Iterator[Pair]:
     """Confident matches, evenly chosen, where the sensor has depth."""
     matcher = FlowMatcher()
     for frame in references:
-        z, pose = image_sets.registered_depth(folder, frame)
+        z, pose = image_sets.registered_depth(folder, frame).z, image_sets.color_pose(folder, frame)
         image = read_rgb(folder / f"frame-{frame:06d}.color.jpg")
         for other in (frame + step for step in STEPS):
             found = matcher(image, read_rgb(folder / f"frame-{other:06d}.color.jpg"))
@@ -59,7 +59,7 @@ def pairs(folder: Path, references: range) -> Iterator[Pair]:
             row, column = np.unravel_index(index, z.shape)
             uv = np.stack([column, row]) + 0.5
             target = found.target.reshape(-1, 2)[index].T.astype(np.float64)
-            T = se3.inverse(image_sets.registered_depth(folder, other)[1]) @ pose
+            T = se3.inverse(image_sets.color_pose(folder, other)) @ pose
             yield Pair(uv, z[row, column].astype(np.float64), target, T)
 
 

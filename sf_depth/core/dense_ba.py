@@ -215,8 +215,9 @@ def linearise(
         system.H[where, where] += information
         system.g[where] -= information * at.turn.ravel()
     bent = len(system.g) - columns.shape[1] + np.flatnonzero(columns[4])
-    system.H[bent, bent] += bend_information(seen, at, sigma)
-    system.g[bent] -= bend_information(seen, at, sigma) * at.theta[4]
+    known = bend_information(seen, at, sigma)
+    system.H[bent, bent] += known
+    system.g[bent] -= known * at.theta[4]
     return system
 
 

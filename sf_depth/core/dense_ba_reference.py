@@ -99,9 +99,9 @@ def linearise(
         where, information = pose * count + np.arange(3 * count), np.repeat(turn_information(seen, at, sigma), 3)
         H[where, where] += information
         g[where] -= information * at.turn.ravel()
-    bent = own + np.flatnonzero(columns[4])
-    H[bent, bent] += bend_information(seen, at, sigma)
-    g[bent] -= bend_information(seen, at, sigma) * at.theta[4]
+    bent, known = own + np.flatnonzero(columns[4]), bend_information(seen, at, sigma)
+    H[bent, bent] += known
+    g[bent] -= known * at.theta[4]
     return System(H, g, E, C, w, scores)
 
 

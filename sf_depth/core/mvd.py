@@ -22,7 +22,6 @@ from sf_depth.core.matched import Matched, matched, thinned
 from sf_depth.core.matching import Matcher, load_matcher, pixel_grid
 from sf_depth.core.outliers import lonely
 from sf_depth.core.parallel import each, one_blas_thread
-from sf_depth.core.posterior import Adjusted
 from sf_depth.core.scale import from_translations
 from sf_depth.core.start import Size, start, triangulate
 from sf_interfaces.errors import FormatError, InsufficientParallax
@@ -77,7 +76,7 @@ class Recovered:
 class _Fit:
     """The optimum of dense BA, the observations that passed the checks, and how sure scale and focal length are."""
 
-    adjusted: Adjusted
+    adjusted: posterior.Adjusted
     seen: Observations
     scale_deviation: float = 0.0  # relative
     contradicted: bool = False
@@ -190,10 +189,10 @@ class MultiViewDepth:
                 )
             good = Observations(seen.uv, seen.target, weight)
             found = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics)
-            at, steady = found.estimate, found.cost
+            at, cost = found.estimate, found.cost
             for deviation, share in _TURNS if turn and last else ():
                 turned = dense_ba.optimum(good, at, poses=poses, intrinsics=intrinsics, turn=deviation)
-                found = turned if turned.cost < (1.0 - share) * steady else found
+                found = turned if turned.cost < (1.0 - share) * cost else found
         return _Fit(posterior.with_covariance(good, found, poses, intrinsics), good)
 
     def _with_lens_and_turns(self, seen: Observations, fit: _Fit, size: Size, free: str) -> _Fit:
@@ -287,15 +286,16 @@ def _triangulated(seen: Observations, theta: Float64, T: Float64) -> Estimate:
 
 def _dense(pairs: Matched, fit: _Fit, size: Size) -> dense_depth.InverseDepth:
     """Inverse depth [H, W] of every pixel whose correspondences pass the checks."""
-    at = fit.adjusted.estimate
+    at, still = fit.adjusted.estimate, replace(fit.adjusted.estimate, turn=None)
     sigma = dense_ba.deviation(dense_ba.squared_residuals(fit.seen, at))
     grid = pixel_grid((size.height, size.width)).reshape(-1, 2)
     weight, target = pairs.weight.reshape(len(at.T), -1), pairs.target.reshape(len(at.T), -1, 2)
 
     def solved(index: np.ndarray) -> dense_depth.InverseDepth:
-        uv, to = np.ascontiguousarray(grid[index].T), np.ascontiguousarray(target[:, index].transpose(0, 2, 1))
-        trusted = checks.checked(weight[:, index], uv, to, at, size.width)
-        return dense_depth.solve(at, uv, dense_ba.steadied(at, to), trusted, sigma, size.width)
+        uv = np.ascontiguousarray(grid[index].T)
+        to = dense_ba.steadied(at, np.ascontiguousarray(target[:, index].transpose(0, 2, 1)))
+        trusted = checks.checked(weight[:, index], uv, to, still, size.width)
+        return dense_depth.solve(still, uv, to, trusted, sigma, size.width)
 
     seen = np.flatnonzero(weight.any(axis=0))
     parts = each(solved, np.array_split(seen, max(1, len(seen) // _BLOCK)))

@@ -57,14 +57,14 @@ def with_covariance(seen: Observations, found: Optimum, poses: bool, intrinsics:
     scores = system.scores - scaled * system.w  # of poses, turns and intrinsics alone, [P, N]
     inverse = _inverse(S)
     covariance = inverse @ _spread(seen.uv, scores, left) @ inverse + sigma**2 * inverse
+    turns = turn_rows(len(at.T), poses) if at.turn is not None else np.zeros(0, int)
     if at.turn is not None:
-        where = turn_rows(len(at.T), poses)
-        told = np.diag(S)[where]
+        told = np.diag(S)[turns]
         pulled = np.repeat(turn_information(seen, at, sigma), 3)  # what the prior has kept small counts whole
-        shift = _without(S, where, at.turn.ravel() * told / np.maximum(told - pulled, _LEAST_OWN * told + 1e-300))
+        shift = _without(S, turns, at.turn.ravel() * told / np.maximum(told - pulled, _LEAST_OWN * told + 1e-300))
         covariance += np.outer(shift, shift)
     common = (scaled * (covariance.astype(np.float32) @ scaled)).sum(axis=0)
-    kept = np.delete(np.arange(len(S)), turn_rows(len(at.T), poses) if at.turn is not None else [])
+    kept = np.delete(np.arange(len(S)), turns)
     covariance = covariance[np.ix_(kept, kept)]
     with np.errstate(divide="ignore"):
         variance = sigma**2 / system.C + common

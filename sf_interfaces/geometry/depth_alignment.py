@@ -32,9 +32,7 @@ _NOISE_PX = 0.3  # deviation of the shift of a single frame
 _LOOSE_PX = 0.7  # shifts that are off the common line by more count less
 _LAG_TOLD_S = 0.004  # deviation of the lag from which on the motion was too little
 _JUMP_FRAMES = 0.6  # a change of the lag by less is none
-_JUMP_GAIN = (
-    8.0  # log-likelihood by which a jump explains the shifts better; chance makes up to 6, with far smaller jumps
-)
+_JUMP_GAIN = 8.0  # log-likelihood by which a jump explains the shifts better; chance makes up to 6
 _JUMP_SIDE = 4  # frames on either side of a jump
 _BORDER_PX = 8  # edges nearer to the border of the image are not looked at
 _EDGES_OF_VIEW = 1000  # of each view, in the fit
