@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-SAMPLE_S, WARM_S, SAVE_S = 5.0, 30.0, 60.0
+SAMPLE_S, WARM_S, SAVE_S, SETTLE_S = 5.0, 30.0, 60.0, 20.0
 FAST = ["--set", "recon.iterations=4"]
 
 
@@ -130,6 +130,21 @@ class Watch:
                 kill += kill_every
                 self._kill(("tracking", "recon")[len(self.outages) % 2])
 
+    def settle(self) -> None:
+        """Listen until two reports in turn say that recon took all that tracking sent: nodes report once a second."""
+        end, still = time.monotonic() + SETTLE_S, 0
+        while time.monotonic() < end and still < 2:
+            before, began = self._keyframes(), time.monotonic()
+            while time.monotonic() < began + 1.5:
+                self._rclpy.spin_once(self._node, timeout_sec=0.2)
+            sent, taken = self._keyframes()
+            still = still + 1 if sent == taken and before == (sent, taken) else 0
+
+    def _keyframes(self) -> tuple[str, str]:
+        """As reported: what tracking sent, what recon took."""
+        sent, taken = (self.values.get(node, {}).get("keyframes", "0") for node in ("tracking", "recon"))
+        return sent, taken
+
     def _kill(self, name: str) -> None:
         for found, process, _ in self._resident():
             if found == name:
@@ -201,6 +216,8 @@ def soak(args: argparse.Namespace) -> dict[str, Any]:
             begin = time.monotonic()
             children.append(subprocess.Popen(line, env=environment))
             watch.run(args.seconds, begin, args.kill_every)
+            children[0].kill()  # what is on its way arrives before anything is counted
+            watch.settle()
             result = summarise(watch, begin, args.seconds)
             children[1].send_signal(signal.SIGINT)
             result["exit_code"] = children[1].wait(timeout=2 * SAVE_S)

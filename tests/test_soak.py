@@ -27,7 +27,7 @@ def test_a_live_line_loses_no_keyframe_and_keeps_its_memory(tmp_path: Path) -> N
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     result = json.loads(out.read_text())
-    assert result["keyframes_taken"] + result["keyframe_queue"] >= result["keyframes_sent"] - 1
+    assert result["keyframes_taken"] == result["keyframes_sent"] > 0
     assert result["frames_tracked"] <= result["images_received"]
     tracking = result["memory"]["tracking"]
     assert tracking["end_mb"] < tracking["start_mb"] + 100
