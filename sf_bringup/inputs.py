@@ -47,11 +47,15 @@ def convert(dataset: Path, out: Path, options: ReadOptions) -> tuple[Written, di
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """The bag to play, how it was read (one sentence each), and the goal that suits it (``auto``: any)."""
+    """The bag to play, how it was read (one sentence each), and the goal that suits it (``auto``: any).
+
+    ``readout_s``: of the shutter of its images, where the data set is known to have a rolling one.
+    """
 
     bag: Path
     notes: tuple[str, ...] = ()
     goal: str = "auto"
+    readout_s: float = 0.0
 
 
 def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolved:
@@ -72,7 +76,7 @@ def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolv
     notes = written.sentences()
     if written.goal != "auto":
         notes.append(f"{written.dataset}: frames have no order in time; without --goal they get {written.goal}")
-    return Resolved(converted, tuple(notes), written.goal)
+    return Resolved(converted, tuple(notes), written.goal, written.readout_s)
 
 
 def with_given(

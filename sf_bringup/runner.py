@@ -148,6 +148,8 @@ def run(request: RunRequest) -> Summary:
     if any(step.sources.get(q) == "input" for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
         preflight.check_extrinsic(given)
     config = ConfigFile.load(request.config, request.overrides)
+    if source.readout_s:
+        config = config.with_default("tracking", "readout_s", source.readout_s)
     config.check_sections({spec.name for spec in load_blocks()} | {"sync", "hosts"})
     folder = RunFolder(request.out)
     _write_facts(folder, request, given, source, made, config)

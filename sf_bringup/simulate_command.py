@@ -23,6 +23,7 @@ _CHANGES = (
     "seed",
     "supersampling",
     "blur",
+    "readout",
     "novel_views",
 )
 
@@ -47,6 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser.add_argument(f"--{name}", type=float)
     parser.add_argument(
         "--blur", type=float, help="exposure in s: motion within it blurs the images, depth stays sharp"
+    )
+    parser.add_argument(
+        "--readout", type=float, help="s from the first to the last row of an image: a rolling shutter, depth has none"
     )
     parser.add_argument("--depth", help="none, exact, structured_light or tof")
     parser.add_argument("--lidar", help="none, spinning64, spinning128 or rosette")

@@ -109,6 +109,10 @@ class ConfigFile:
         """The configuration of one section."""
         return build(cls, self.sections.get(section, {}), where=f"section '{section}'")
 
+    def with_default(self, section: str, key: str, value: Any) -> ConfigFile:
+        """The same, with a value where neither the file nor an override says otherwise."""
+        return ConfigFile({**self.sections, section: {key: value, **self.sections.get(section, {})}})
+
     def check_sections(self, known: set[str]) -> None:
         """Raise ConfigError for a section no block has."""
         for name in self.sections:

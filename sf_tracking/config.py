@@ -43,6 +43,10 @@ class TrackingConfig:
     lidar_sigma: float = option(0.015, "noise of LiDAR depth, m", low=1e-4)
     min_quality: float = option(0.002, "corner quality of a patch relative to the image's best", low=0.0, high=1.0)
     max_depth: float = option(80.0, "measured depths beyond are not used, m", low=0.1)
+    readout_s: float = option(
+        0.0, "s from the first to the last row of a rolling shutter; 0: global", low=-0.1, high=0.1
+    )
+    depth_readout_s: float = option(0.0, "the same of depth images", low=-0.1, high=0.1)
     loops: bool = option(True, "close loops: correct the keyframes where the camera comes back to a known place")
     patience: int = option(8, "lost frames after which the whole map is searched", low=1)
     seed: int = option(0, "seed of the wide search")

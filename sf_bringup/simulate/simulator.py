@@ -24,6 +24,7 @@ from sf_interfaces.types import DepthMap, Float32, Float64, PointCloud, UInt8
 START_NS = 1_000_000_000_000
 _SKY = 1e4  # m
 _MOST = 90.0  # percent of the pixels
+_BAND = 4  # rows that are read at the same time
 _PARTS = ((-0.25, -0.25), (0.25, 0.25), (-0.25, 0.25), (0.25, -0.25))  # px, of a pixel's four quarters
 OPTICAL, LIDAR = "camera_optical_frame", "lidar"
 T_BASE_CAMERA_LINK = se3.exp(np.array([0.05, 0.0, 0.0, 0, 0, 0]))
@@ -65,6 +66,8 @@ class Simulator:
         image, z = self.renderer.render(self.spec.camera, T, 1 if self.spec.blur else self.spec.supersampling)
         if self.spec.blur:
             image = self._exposed(index / self.spec.fps, z)
+        elif self.spec.readout:
+            image = self._rolled(index / self.spec.fps)
         rng = np.random.default_rng([self.spec.seed, 1, index])
         if self.spec.image_noise:
             noise = rng.standard_normal(image.shape, dtype=np.float32) * np.float32(self.spec.image_noise)
@@ -93,6 +96,16 @@ class Simulator:
             T = self.path.pose(middle + ((k + 0.5) / count - 0.5) * spec.blur)
             total += self.renderer.render(through, T, 1)[0]
         return np.asarray(np.round(total / count), np.uint8)
+
+    def _rolled(self, middle: float) -> UInt8:
+        """The image of a rolling shutter that reads the row of the principal point at ``middle`` s."""
+        spec, camera, bands = self.spec, self.spec.camera, []
+        for first in range(0, spec.height, _BAND):
+            rows = min(_BAND, spec.height - first)
+            late = (first + rows / 2 - camera.cy) / spec.height * spec.readout
+            band = replace(camera, height=rows, cy=camera.cy - first)
+            bands.append(self.renderer.render(band, self.path.pose(middle + late), spec.supersampling)[0])
+        return np.concatenate(bands)
 
     def novel_pose(self, index: int) -> Float64:
         """T_map_camera of a view off the path: up to half the free distance away, turned by up to 20 degrees."""

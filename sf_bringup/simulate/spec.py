@@ -23,6 +23,7 @@ class SimulationSpec:
         frames, fps: length and rate of the camera; width, height, focal: px; path: None = the scene's.
         rgb, depth, lidar: the sensors; lidar_hz: sweeps per second; lidar_fov_deg: horizontal field.
         image_noise: deviation in grey levels; blur: exposure, s; supersampling: n x n rays on edges;
+        readout: s from the first to the last row of an image, depth is taken at once, half way;
         ground_truth_depth: also write it; novel_views: images off the path to write under /ground_truth/novel.
     """
 
@@ -39,6 +40,7 @@ class SimulationSpec:
     lidar_fov_deg: float = 360.0
     image_noise: float = 1.0
     blur: float = 0.0
+    readout: float = 0.0
     supersampling: int = 2
     ground_truth_depth: bool = True
     novel_views: int = 0
@@ -56,6 +58,10 @@ class SimulationSpec:
             raise ConfigError("frames, fps, lidar_hz and supersampling of a simulation must be positive")
         if not 0 <= self.blur <= 1 / self.fps:
             raise ConfigError(f"blur must lie between 0 and the {1 / self.fps:.4g} s of a frame, got {self.blur:g}")
+        if abs(self.readout) > 1 / self.fps:
+            raise ConfigError(f"readout takes at most the {1 / self.fps:.4g} s of a frame, got {self.readout:g}")
+        if self.blur and self.readout:
+            raise ConfigError("blur and readout cannot be simulated together; leave one of them at 0")
 
     @property
     def camera(self) -> Camera:

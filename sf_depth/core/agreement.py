@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sf_depth.core import pinhole
 from sf_depth.core.matching import pixel_grid
@@ -36,11 +37,13 @@ class Swept:
 
     Args:
         d: [h, w], in the unit of its pose; a fraction of the size of its image.
+        known: [h, w] bool, where that means something.
         baseline: distance of the source farthest from it.
     """
 
     keyframe: Keyframe
     d: Float32
+    known: NDArray[np.bool_]
     baseline: float
 
     @property
@@ -83,7 +86,7 @@ def confirmed(own: Swept, others: Sequence[Swept]) -> DepthMap:
         total += np.where(confirms, one.d, np.float32(0))
         count += confirms
         denied += one.apart < -alike
-    d = np.where(count > denied, total / (count + 1), np.float32(np.nan))
+    d = np.where((count > denied) & own.known.reshape(-1), total / (count + 1), np.float32(np.nan))
     sigma = _SIGMA * noise_px * (1 + _DENIED * denied) / np.maximum(count, 1) / disparity
     relative = np.hypot(sigma, _SHARED * noise).astype(np.float32)
     z = 1.0 / _enlarged(d.reshape(shape), size)
@@ -112,7 +115,9 @@ def _asked(own: Swept, other: Swept, x: Float32) -> _Said:
     col, row = np.floor(pinhole.project(other.theta, y)).astype(np.int64)
     height, width = other.d.shape
     inside = (X[2] > _MIN_Z) & (col >= 0) & (col < width) & (row >= 0) & (row < height)
-    theirs = np.where(inside, other.d[row.clip(0, height - 1), col.clip(0, width - 1)], np.float32(1))
+    place = row.clip(0, height - 1), col.clip(0, width - 1)
+    inside &= other.known[place] & own.known.reshape(-1)
+    theirs = np.where(inside, other.d[place], np.float32(1))
     # The depth of their point in our camera, in units of theirs.
     back = T[:2, 2] @ y + T[2, 2] - (T[:3, 2] @ T[:3, 3]) * theirs
     inside &= back > _MIN_Z

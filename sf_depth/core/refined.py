@@ -25,8 +25,8 @@ _ALIKE = 10.0  # grey levels at which a pixel around counts 1 / e
 _NEAREST = 0.5  # of the least inverse depth: no step leads beyond
 
 
-def refined(part: Compared, d: Float32, spacing: float) -> Float32:
-    """Inverse depth [h, w] off the planes, from that on the planes.
+def refined(part: Compared, d: Float32, spacing: float) -> tuple[Float32, Float32]:
+    """Inverse depth [h, w] off the planes, from that on the planes, and how unlike the images are there.
 
     Args:
         spacing: inverse depth between two planes.
@@ -40,7 +40,7 @@ def refined(part: Compared, d: Float32, spacing: float) -> Float32:
         for other, cost in zip(beside, each(lambda at: together(part.dissimilarity_of(at)), beside), strict=True):
             better = cost < best - gain
             d, best = np.where(better, other, d), np.where(better, cost, best)
-    return np.asarray(cv2.medianBlur(d, 3))
+    return np.asarray(cv2.medianBlur(d, 3)), best
 
 
 class _Together:

@@ -26,6 +26,10 @@ _BEFORE, _AFTER = 6, 3  # swept keyframes that are asked about the depth of one
 _PATCH = 7  # px, side of the squares around landmarks that have to look alike in a source
 _ALIKE = 0.3  # correlation of half the landmarks; where a pose is wrong it is about 0
 _LEAST_LANDMARKS = 8
+# What has no texture is as unlike on every plane of a sweep, and whole fronts come to lie on near ones, where sources
+# lose sight of them. So in front of all landmarks depth counts only where the images are alike.
+_IN_FRONT = 1.5  # times the inverse depth of the nearest landmarks
+_UNLIKE = 0.4  # dissimilarity
 
 
 def relative(frame: Keyframe, sources: list[Keyframe]) -> Float64:
@@ -51,8 +55,9 @@ def swept(frame: Keyframe, sources: list[Keyframe]) -> Swept:
     at = Estimate(pinhole.theta_of(frame.camera), T[good], 1.0 / points[:, 2])
     reduction = max(1, round(frame.camera.width / _WIDTH))
     part, planes = compare(frame.image, [sources[j].image for j in good], at, reduction), planes_of(at, reduction)
-    d = refined(part, sweep(part, planes), float(planes[1] - planes[0]))
-    return Swept(frame, d, float(np.linalg.norm(T[good, :3, 3], axis=1).max()))
+    d, unlike = refined(part, sweep(part, planes), float(planes[1] - planes[0]))
+    known = (d < _IN_FRONT * np.quantile(at.inverse_depth, 0.99)) | (unlike < _UNLIKE)
+    return Swept(frame, d, known, float(np.linalg.norm(T[good, :3, 3], axis=1).max()))
 
 
 def _alike(first: UInt8, second: UInt8, frame: Keyframe, points: Float64, T: Float64) -> float:

@@ -12,14 +12,17 @@ import numpy as np
 from sf_interfaces.corrections import Correction
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
+from sf_interfaces.geometry.rolling_shutter import nearness
 from sf_interfaces.types import Camera, Float64, Frame, Keyframe, Scale, Trajectory
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.between import Between
 from sf_tracking.core.initialise import Initialiser
 from sf_tracking.core.keyframes import wants_keyframe
 from sf_tracking.core.locate import Location, Locator, blind_location
+from sf_tracking.core.relief import known_points
 from sf_tracking.core.search import relocate
 from sf_tracking.core.shape import fit, shape_of
+from sf_tracking.core.shutter import Shutter
 from sf_tracking.core.update import UpdateOperator, View, make_operator
 from sf_tracking.core.window import Window
 
@@ -45,7 +48,8 @@ class TrackingUpdate:
         T_map_camera: provisional pose, None while lost or before the map exists.
         keyframes: those whose pose became final with this frame, oldest first.
         scale: ARBITRARY where the map began without depth.
-        edges: observations used for the pose; inliers: those that agree with it.
+        edges: observations used for the pose; inliers: those that agree with it; excess: their squared errors
+            relative to what alignment claims, typically, at least 1.
         correction: of all final keyframes, where a loop was closed; ``keyframes`` that are not the last of this
             update still have pose and unit from before it.
         T_map_odom: what loops have corrected so far.
@@ -58,6 +62,7 @@ class TrackingUpdate:
     scale: Scale = Scale.METRIC
     edges: int = 0
     inliers: int = 0
+    excess: float = 1.0
     correction: Correction | None = None
     T_map_odom: Float64 | None = None
 
@@ -88,6 +93,7 @@ class Tracker:
         self._window = Window(config, self._operator)
         self._initialiser = Initialiser(config, self._operator, self._window, self._locate)
         self._between = Between(config.window)
+        self._shutter = Shutter(config)
         self._final: dict[int, Float64] = {}  # stamp of keyframe -> T_map_camera
         self._relative: dict[int, tuple[int, Float64]] = {}  # stamp -> (stamp of its keyframe, T_keyframe_frame)
         self._recent: list[tuple[int, Float64]] = []  # the last two (stamp, T_cw), for the motion model
@@ -106,12 +112,10 @@ class Tracker:
             FormatError: the frame has no image or camera, or its stamp does not increase.
         """
         camera = self._check(frame)
-        assert frame.image is not None
-        view = self._operator.view(frame.image)
         self._newest = frame.stamp_ns
         if not len(self._window):
-            return self._start(frame, view)
-        found = self._find(frame.stamp_ns, view, camera)
+            return self._start(frame)
+        frame, view, found = self._seen(frame, camera)
         if self._config.shape_trust and (found is None or found.doubtful):
             found = self._fit_shape(frame, found)
         if found is None:
@@ -157,23 +161,24 @@ class Tracker:
             raise FormatError("the camera changed within the sequence; start a new run for another camera")
         return frame.camera
 
-    def _start(self, frame: Frame, view: View) -> TrackingUpdate:
+    def _start(self, rolled: Frame) -> TrackingUpdate:
         """The first frame with depth, or frames with parallax between them, begin the map."""
-        poses = self._initialiser(frame, view)
+        frame = self._shutter.before_map(rolled)
+        poses = [] if frame is None else self._initialiser(frame, self._view(frame))
         if not len(self._window):
-            return TrackingUpdate(frame.stamp_ns, None, self.state, scale=self.scale)
+            return TrackingUpdate(rolled.stamp_ns, None, self.state, scale=self.scale)
         first = self._window.keyframes[0]
         for stamp, T_cw, sights in poses:
             self._relative[stamp] = (first.frame.stamp_ns, first.T_cw @ se3.inverse(T_cw))
             self._between.add(stamp, sights, self._window.keyframes)
         self.state = TrackingState.TRACKING
-        return self._tracked(frame.stamp_ns, (), None)
+        return self._tracked(rolled.stamp_ns, (), None)
 
     def _tracked(self, stamp_ns: int, finished: tuple[Keyframe, ...], found: Location | None) -> TrackingUpdate:
         T_map_camera = self._pose_of(stamp_ns)
         self._recent = [*self._recent, (stamp_ns, se3.inverse(T_map_camera))][-2:]
-        edges, inliers = (len(found.sights), found.inliers) if found is not None else (0, 0)
-        return TrackingUpdate(stamp_ns, T_map_camera, self.state, finished, self.scale, edges, inliers)
+        edges, inliers, excess = (0, 0, 1.0) if found is None else (len(found.sights), found.inliers, found.excess)
+        return TrackingUpdate(stamp_ns, T_map_camera, self.state, finished, self.scale, edges, inliers, excess)
 
     def _predict(self, stamp_ns: int) -> Float64:
         """Damped constant motion: exp(damping * dt ratio * log(T_n-1 T_n-2^-1)) T_n-1."""
@@ -184,6 +189,26 @@ class Tracker:
         # Damping guards the rare frame after a gap; with regular frames the full motion predicts best.
         share = self._config.damping if ratio > _REGULAR else 1.0
         return se3.exp(share * ratio * se3.log(T1 @ se3.inverse(T0))) @ T1
+
+    def _seen(self, rolled: Frame, camera: Camera) -> tuple[Frame, View, Location | None]:
+        """The frame as a global shutter takes it, its view and its pose; once more where the pose tells better."""
+        window = self._window.keyframes
+        if not self._shutter:
+            view = self._view(rolled)
+            return rolled, view, self._find(rolled.stamp_ns, view, camera)
+        near = nearness(camera, *known_points(window, self._predict(rolled.stamp_ns)))
+        frame = self._shutter.expected(rolled, self._recent, near)
+        view = self._view(frame)
+        found = self._find(frame.stamp_ns, view, camera)
+        better = None if found is None else self._shutter.corrected(rolled, self._recent, found.T_cw, near)
+        if found is None or better is None:
+            return frame, view, found
+        view = self._view(better)
+        return better, view, self._locate.align(window, view, found.T_cw) or found
+
+    def _view(self, frame: Frame) -> View:
+        assert frame.image is not None
+        return self._operator.view(frame.image)
 
     def _find(self, stamp_ns: int, view: View, camera: Camera) -> Location | None:
         """Pose from the prediction; failing that with the full search range; failing that by descriptors."""

@@ -96,6 +96,25 @@ def test_motion_during_the_exposure_blurs_an_edge_into_a_ramp_of_known_length() 
         replace(spec, blur=0.2)
 
 
+def test_a_rolling_shutter_slants_an_edge_by_what_the_camera_moves_while_it_is_read() -> None:
+    spec = SimulationSpec("lounge", width=160, height=120, focal=100.0, image_noise=0.0, fps=10.0, readout=0.05)
+    builder = SceneBuilder(0)
+    white = builder.textures.add(np.full((8, 8, 3), 255, np.uint8))
+    for left, shade in ((0.0, 0.1), (-4.0, 0.7)):  # an edge straight ahead at t = 0, 2 m away
+        builder.quad((2.0, left, -2.0), (0, 4, 0), (0, 0, 4), white, tint=(shade,) * 3, gloss=0.0)
+    simulator = Simulator(spec)
+    simulator.renderer, simulator.path = Renderer(builder.build(ambient=1.0)), _Sideways(4.0)  # type: ignore[assignment]
+    image, z, T = simulator.frame(0)
+    assert T[1, 3] == 0.0 and np.nanmax(np.abs(z - 2.0)) < 1e-4
+    edge = (image[:, :, 0] < image[60].mean()).sum(axis=1)  # px of the dark side
+    late = (np.arange(120) + 0.5 - 60) / 120 * 0.05
+    np.testing.assert_allclose(edge, 80 - 100 * 4.0 * late / 2.0, atol=1.0)
+    with pytest.raises(ConfigError, match="readout"):
+        replace(spec, readout=0.2)
+    with pytest.raises(ConfigError, match="together"):
+        replace(spec, blur=0.01)
+
+
 def test_structured_light_noise_grows_with_the_square_of_depth() -> None:
     rng = np.random.default_rng(0)
     near, far = (structured_light(np.full((100, 100), z, np.float32), 480.0, rng) for z in (1.0, 3.0))

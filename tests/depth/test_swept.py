@@ -28,7 +28,10 @@ def keyframes(count: int = 4) -> list[Keyframe]:
 
 def exact(count: int = 4) -> list[Swept]:
     """Keyframes as a perfect sweep would leave them."""
-    return [Swept(frame, 1 / z, 0.5) for frame, z in zip(keyframes(count), room(count).z, strict=True)]
+    return [
+        Swept(frame, 1 / z, np.ones(z.shape, bool), 0.5)
+        for frame, z in zip(keyframes(count), room(count).z, strict=True)
+    ]
 
 
 def test_what_is_wrong_in_one_keyframe_alone_is_left_out_and_what_is_right_stays() -> None:
@@ -59,10 +62,32 @@ def test_the_variance_follows_what_keyframes_disagree_by() -> None:
 
 
 def test_a_reduced_sweep_is_enlarged_within_surfaces() -> None:
-    own, *others = [replace(one, d=one.d[1::2, 1::2].copy()) for one in exact()]
+    own, *others = [replace(one, d=one.d[1::2, 1::2].copy(), known=one.known[1::2, 1::2]) for one in exact()]
     found = confirmed(own, others)
     assert found.z.shape == (240, 320)
     assert np.nanmedian(np.abs(found.z / room(4).z[0] - 1)) < 0.01
+
+
+def test_depth_in_front_of_all_landmarks_counts_only_where_the_images_are_alike() -> None:
+    frame, *sources = keyframes()
+    image = frame.image.copy()
+    image[80:160, 120:200] = 128  # nothing there that a source could show
+    bare = np.zeros(image.shape[:2], bool)
+    bare[84:156, 124:196] = True
+    found = swept(replace(frame, image=image), sources)
+    assert frame.landmarks is not None
+    in_front = found.d > 1.5 * np.quantile(1 / frame.landmarks.points[:, 2], 0.99)
+    assert not (found.known & in_front & bare).any()
+    assert found.known[~bare].mean() > 0.98
+
+
+def test_what_is_not_known_is_neither_confirmed_nor_confirms() -> None:
+    own, *others = exact()
+    unknown = np.zeros(own.d.shape, bool)
+    unknown[60:120, 80:160] = True
+    found = confirmed(replace(own, known=~unknown), others)
+    assert not found.valid[unknown].any() and found.valid[~unknown].mean() > 0.9
+    assert not confirmed(own, [replace(other, known=np.zeros_like(unknown)) for other in others]).valid.any()
 
 
 def test_a_source_whose_pose_is_wrong_does_not_count() -> None:

@@ -88,6 +88,7 @@ class Dataset(ABC):
         depth_units: stored units in one metre of its depth images; None where it has no such images.
         depth_encoding: 16UC1 where millimetres lose nothing, else 32FC1.
         goal: what frames without an order in time are for; ``auto`` for a sequence.
+        readout_s: s from the first to the last row of an image, where its shutter is known to roll.
 
     Args:
         path: the folder (or file) the user gave.
@@ -102,6 +103,7 @@ class Dataset(ABC):
     depth_units: ClassVar[float | None] = None
     depth_encoding: ClassVar[str] = "16UC1"
     goal: ClassVar[str] = "auto"
+    readout_s: ClassVar[float] = 0.0
 
     @staticmethod
     @abstractmethod

@@ -57,6 +57,8 @@ class SevenScenes(Dataset):
 
     DEPTH_CAMERA: ClassVar[Camera] = Camera(640, 480, 585.0, 585.0, 320.5, 240.5, OPTICAL)
     COLOR_CAMERA: ClassVar[Camera] = Camera(640, 480, 525.0, 525.0, 320.5, 240.5, OPTICAL)
+    readout_s: ClassVar[float] = 0.024
+
     # Of both cameras alike, so that depth is registered by pinholes and shares the lens of the image.
     LENS: ClassVar[Distortion] = Distortion("plumb_bob", (-0.035, 0.0, 0.0, 0.0))
     T_COLOR_DEPTH: ClassVar[Float64] = se3.orthonormalise(
@@ -105,6 +107,8 @@ class SevenScenes(Dataset):
         return (
             "depth is registered to the colour camera (f 525) with a rotation measured on RedKitchen, another sensor "
             "may differ: sf doctor tells; times are nominal, 30 Hz",
+            f"the shutter of the colour camera rolls: its rows are read within {1e3 * self.readout_s:.0f} ms, which "
+            "tracking undoes (of a bag made from it: --set tracking.readout_s)",
         )
 
 
