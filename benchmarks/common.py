@@ -106,12 +106,19 @@ def simulated(spec: SimulationSpec, out: Path) -> tuple[Path, Path]:
     return bag, mesh
 
 
+def keep_metadata(reader: BagReader, writer: SequenceWriter) -> None:
+    """A copy of a bag knows what the bag says of its camera."""
+    for name, values in reader.metadata().items():
+        writer.bag.metadata(name, values)
+
+
 def without(bag: Path, topics: Sequence[str], suffix: str) -> Path:
     """A copy of a bag beside it that lacks some topics."""
     out = bag.with_name(f"{bag.stem}-{suffix}.mcap")
     if not out.is_file():
         unfinished = out.with_suffix(".unfinished.mcap")
         with BagReader(bag) as reader, SequenceWriter(unfinished) as writer:
+            keep_metadata(reader, writer)
             for raw in reader.messages([name for name in reader.topics if name not in topics]):
                 writer.bag.write(raw.topic, raw.type, raw.stamp_ns, raw.data)
         unfinished.rename(out)
@@ -122,6 +129,7 @@ def thinned(bag: Path, frames: Sequence[int], suffix: str) -> Path:
     """A copy of a bag that keeps only some of its frames (numbers in order of time), and what belongs to none."""
     out = bag.with_name(f"{bag.stem}-{suffix}.mcap")
     with BagReader(bag) as reader, SequenceWriter(out) as writer:
+        keep_metadata(reader, writer)
         stamps = [raw.stamp_ns for raw in reader.messages([COLOUR])]
         dropped = set(stamps) - {stamps[k] for k in frames}
         for raw in reader.messages():

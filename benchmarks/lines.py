@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import keep_metadata
 
 from sf_bringup.eval_files import read_surface
 from sf_bringup.inputs import convert
@@ -104,6 +105,7 @@ def derive(whole: Path, line: Line, target: Path) -> Path:
     left_out = skipped(whole) if line.goal == "mvd" else frozenset()
     with BagReader(whole) as reader, SequenceWriter(target) as writer:
         # Where nothing better is known, a depth camera is the reference of what is estimated from images.
+        keep_metadata(reader, writer)
         wanted = line.topics if TRUE_DEPTH in reader.topics else {*line.topics, DEPTH}
         for raw in reader.messages():
             if raw.topic not in wanted and not raw.topic.startswith(("/ground_truth/", "/tf_static")):

@@ -17,7 +17,7 @@ from sf_interfaces.io import datasets
 from sf_interfaces.io.atomic import replace_file
 from sf_interfaces.io.bag import BagReader, RawMessage, is_bag
 from sf_interfaces.io.datasets import ReadOptions, Written
-from sf_interfaces.io.sequence_writer import SequenceWriter
+from sf_interfaces.io.sequence_writer import SHUTTER, SequenceWriter
 from sf_interfaces.io.trajectory import read_tum
 from sf_interfaces.types import Camera, Float64
 
@@ -47,15 +47,11 @@ def convert(dataset: Path, out: Path, options: ReadOptions) -> tuple[Written, di
 
 @dataclass(frozen=True, slots=True)
 class Resolved:
-    """The bag to play, how it was read (one sentence each), and the goal that suits it (``auto``: any).
-
-    ``readout_s``: of the shutter of its images, where the data set is known to have a rolling one.
-    """
+    """The bag to play, how it was read (one sentence each), and the goal that suits it (``auto``: any)."""
 
     bag: Path
     notes: tuple[str, ...] = ()
     goal: str = "auto"
-    readout_s: float = 0.0
 
 
 def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolved:
@@ -76,7 +72,23 @@ def resolve(inputs: tuple[Path, ...], out: Path, options: ReadOptions) -> Resolv
     notes = written.sentences()
     if written.goal != "auto":
         notes.append(f"{written.dataset}: frames have no order in time; without --goal they get {written.goal}")
-    return Resolved(converted, tuple(notes), written.goal, written.readout_s)
+    return Resolved(converted, tuple(notes), written.goal)
+
+
+def readout_of(bag: Path) -> float:
+    """s from the first to the last row of its images, where the bag says so; else 0.
+
+    Raises:
+        FormatError: what it says is no number.
+    """
+    with BagReader(bag) as reader:
+        said = reader.metadata().get(SHUTTER, {}).get("readout_s", "0")
+    try:
+        return float(said)
+    except ValueError as error:
+        raise FormatError(
+            f"{bag}: metadata '{SHUTTER}' has readout_s '{said}', which is no number of seconds"
+        ) from error
 
 
 def with_given(

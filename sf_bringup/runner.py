@@ -22,7 +22,7 @@ from sf_bringup.preflight import BagInput
 from sf_bringup.run_folder import RunFolder, unpack
 from sf_bringup.summary import Summary, summarise, write_page
 from sf_interfaces import topics
-from sf_interfaces.blocks import load_blocks
+from sf_interfaces.blocks import Quantity, load_blocks
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import ConfigError
 from sf_interfaces.io.calibration import read_camera, read_extrinsic
@@ -147,9 +147,7 @@ def run(request: RunRequest) -> Summary:
     made.check_runnable()
     if any(step.sources.get(q) == "input" for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
         preflight.check_extrinsic(given)
-    config = ConfigFile.load(request.config, request.overrides)
-    if source.readout_s:
-        config = config.with_default("tracking", "readout_s", source.readout_s)
+    config = with_shutter(ConfigFile.load(request.config, request.overrides), made, source.bag)
     config.check_sections({spec.name for spec in load_blocks()} | {"sync", "hosts"})
     folder = RunFolder(request.out)
     _write_facts(folder, request, given, source, made, config)
@@ -162,6 +160,18 @@ def run(request: RunRequest) -> Summary:
     summary = summarise(folder)
     write_page(summary)
     return summary
+
+
+def with_shutter(config: ConfigFile, made: Plan, bag: Path) -> ConfigFile:
+    """The configuration, with the readout that the bag says its images have, where tracking gets these as they are.
+
+    Raises:
+        FormatError: what it says is no number.
+    """
+    tracking = made.step("tracking")
+    direct = tracking is not None and tracking.sources.get(Quantity.IMAGE) == "input"
+    readout = inputs.readout_of(bag) if direct else 0.0
+    return config.with_default("tracking", "readout_s", readout) if readout else config
 
 
 def _engine(name: str) -> Any:

@@ -161,6 +161,8 @@ def simulate(
     sweeps = 0
     novel = set(np.linspace(0, spec.frames - 1, spec.novel_views + 2).astype(int)[1:-1].tolist())
     with SequenceWriter(out) as writer:
+        if spec.readout:
+            writer.shutter(spec.readout)
         first = START_NS - round(1e9 / spec.lidar_hz)
         writer.tf_static("base_link", "camera_link", T_BASE_CAMERA_LINK, first)
         writer.tf_static("camera_link", OPTICAL, T_LINK_OPTICAL, first)

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from mcap.reader import make_reader
 from rosbags.convert.converter import migrate_bytes
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, Qos
@@ -115,6 +116,16 @@ class BagReader:
     @property
     def torn(self) -> bool:
         return self._torn is not None
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Named records of strings of an mcap file that was finished; other bags have none."""
+        files = sorted(self.path.glob("*.mcap")) if self.path.is_dir() else [self.path]
+        found: dict[str, dict[str, str]] = {}
+        for path in files if not self.torn else []:
+            if path.suffix == ".mcap":
+                with path.open("rb") as file:
+                    found |= {record.name: dict(record.metadata) for record in make_reader(file).iter_metadata()}
+        return found
 
     def _open_torn(self, path: Path) -> None:
         self._torn = torn = TornMcap(path)

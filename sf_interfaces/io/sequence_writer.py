@@ -20,6 +20,9 @@ _IMAGE, _INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 _STATE = "sf_interfaces/msg/KeyframeState"
 
 
+SHUTTER = "shutter"  # metadata of a bag: no message of ROS says how a camera reads its rows
+
+
 class SequenceWriter:
     """An mcap bag of typed data; every message is logged at its own stamp. Also a context manager."""
 
@@ -43,6 +46,10 @@ class SequenceWriter:
 
     def _write(self, topic: str, kind: str, stamp_ns: int, msg: Any) -> None:
         self.bag.write(topic, kind, stamp_ns, bytes(self._store.serialize_cdr(msg, kind)))
+
+    def shutter(self, readout_s: float) -> None:
+        """That rows of the colour images are read one after the other, the last one ``readout_s`` after the first."""
+        self.bag.metadata(SHUTTER, {"readout_s": f"{readout_s:g}"})
 
     def image(self, topic: str, stamp_ns: int, image: UInt8, frame_id: str) -> None:
         """RGB [H, W, 3] or mono [H, W] uint8."""

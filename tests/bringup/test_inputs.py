@@ -13,14 +13,18 @@ import pytest
 import yaml
 
 from sf_bringup.cli import main
+from sf_bringup.inputs import readout_of
 from sf_bringup.lenses import image_decoder
+from sf_bringup.planner import plan
 from sf_bringup.run_folder import RunFolder
-from sf_bringup.runner import RunRequest, prepare
-from sf_interfaces.blocks import Quantity
+from sf_bringup.runner import RunRequest, prepare, with_shutter
+from sf_interfaces.blocks import Quantity, load_blocks
+from sf_interfaces.config import ConfigFile
 from sf_interfaces.errors import CalibrationError, FormatError
 from sf_interfaces.io.bag import BagReader
 from sf_interfaces.io.calibration import read_camera
-from sf_interfaces.io.datasets import ReadOptions
+from sf_interfaces.io.datasets import ReadOptions, SevenScenes
+from sf_interfaces.io.sequence_writer import SHUTTER, SequenceWriter
 from sf_interfaces.ros.messages import decode_image
 from sf_interfaces.ros.sensors import SensorInputs
 from sf_interfaces.sync import SyncConfig
@@ -218,3 +222,31 @@ def test_an_input_that_is_not_there(tmp_path: Path) -> None:
         prepare(RunRequest((tmp_path / "none",), out=tmp_path))
     with pytest.raises(FormatError, match="exactly one"):
         prepare(RunRequest((tmp_path, tmp_path), out=tmp_path))
+
+
+def one_image(path: Path, **metadata: str) -> Path:
+    with SequenceWriter(path) as writer:
+        writer.image("/camera/color/image_raw", 1_000_000_000, np.zeros((12, 16), np.uint8), "camera")
+        if metadata:
+            writer.bag.metadata(SHUTTER, metadata)
+    return path
+
+
+def test_what_a_bag_says_about_its_shutter_reaches_tracking_alone(tmp_path: Path) -> None:
+    layouts.seven_scenes(tmp_path / "set", 2)
+    given, _ = prepare(RunRequest((tmp_path / "set",), out=tmp_path / "out"))
+    assert readout_of(given.bag) == SevenScenes.readout_s > 0
+    colour, depth = frozenset({Quantity.IMAGE, Quantity.INTRINSICS}), frozenset({Quantity.DEPTH, Quantity.INTRINSICS})
+    line, of_depth, posed = (
+        plan(quantities, goal, load_blocks())
+        for quantities, goal in ((colour, "slam"), (depth, "slam"), (colour | {Quantity.GIVEN_POSE}, "recon"))
+    )
+    empty = ConfigFile({})
+    assert with_shutter(empty, line, given.bag).sections["tracking"] == {"readout_s": SevenScenes.readout_s}
+    for other in (of_depth, posed):  # images made of depth, and no tracking at all
+        assert not with_shutter(empty, other, given.bag).sections
+    own = ConfigFile({"tracking": {"readout_s": 0.0, "patches": 100}})
+    assert with_shutter(own, line, given.bag).sections == own.sections
+    assert not with_shutter(empty, line, one_image(tmp_path / "plain.mcap")).sections
+    with pytest.raises(FormatError, match="'soon', which is no number"):
+        with_shutter(empty, line, one_image(tmp_path / "bad.mcap", readout_s="soon"))

@@ -52,6 +52,7 @@ def test_every_reader_opens_it(tmp_path: Path) -> None:
         assert [r.stamp_ns for r in raws] == sorted(r.stamp_ns for r in raws) and len(raws) == 121
         depth = [messages.decode_depth(bag.decode(r)) for r in bag.messages(["/depth"])]
         np.testing.assert_allclose([d.z[0, 0] for d in depth], 1 + 0.001 * np.arange(20), atol=1e-6)
+        assert bag.metadata() == {"scenefactory": {"version": "1"}}
     with AnyReader([path]) as reader:
         assert reader.message_count == 121
     foreign = {m.channel.topic: m.ros_msg for m in read_ros2_messages(str(path))}

@@ -108,7 +108,7 @@ class SevenScenes(Dataset):
             "depth is registered to the colour camera (f 525) with a rotation measured on RedKitchen, another sensor "
             "may differ: sf doctor tells; times are nominal, 30 Hz",
             f"the shutter of the colour camera rolls: its rows are read within {1e3 * self.readout_s:.0f} ms, which "
-            "tracking undoes (of a bag made from it: --set tracking.readout_s)",
+            "tracking undoes",
         )
 
 

@@ -50,10 +50,7 @@ class ReadOptions:
 
 @dataclass(slots=True)
 class Written:
-    """What became of a data set: its goal, frames written, with a pose, and skipped, why (the first ones), notes.
-
-    ``readout_s``: of the shutter of its images, see :class:`Dataset`.
-    """
+    """What became of a data set: its goal, frames written, with a pose, and skipped, why (the first ones), notes."""
 
     dataset: str
     goal: str = "auto"
@@ -62,7 +59,6 @@ class Written:
     skipped: int = 0
     reasons: list[str] = field(default_factory=list)
     notes: tuple[str, ...] = ()
-    readout_s: float = 0.0
 
     def sentences(self) -> list[str]:
         """For the user, one line each."""
@@ -122,7 +118,9 @@ def write(
         raise ConfigError(f"--depth-scale {options.depth_scale:g}: {dataset.name} has no depth it could scale")
     # With poses given, frames need no order: whatever their poses allow can be made of them.
     goal = "auto" if options.use_poses else dataset.goal
-    done = Written(dataset.name, goal, notes=tuple(dataset.notes()), readout_s=dataset.readout_s)
+    done = Written(dataset.name, goal, notes=tuple(dataset.notes()))
+    if dataset.readout_s:
+        writer.shutter(dataset.readout_s)
     sizes = _Sizes()
     total = len(dataset)
     for read in dataset.samples():
