@@ -26,8 +26,9 @@ _SAME = 0.1  # relative difference of inverse depths of what may be one surface 
 _MIN_Z = 0.05  # of the own depth; nearer to another camera nothing is compared
 # Measured against exact and sensor depth, in units of what keyframes typically disagree by: a point that one other
 # keyframe confirms errs by so much (1 sigma), one that n confirm by an n-th of it, as far as poses are right; each that
-# sees through it makes it less sure. What poses get wrong all keyframes may share.
-_SIGMA, _DENIED, _SHARED = 5.0, 0.7, 0.8
+# sees through it makes it less sure, and a little each that sees something in front of it. What poses get wrong all
+# keyframes may share.
+_SIGMA, _DENIED, _HIDDEN, _SHARED = 5.0, 0.7, 0.3, 0.8
 _CONTINUOUS = 0.02  # relative difference within one surface: there depth is interpolated
 
 
@@ -80,14 +81,16 @@ def confirmed(own: Swept, others: Sequence[Swept]) -> DepthMap:
     own_d, disparity = own.d.reshape(-1), own.disparity.reshape(-1)
     noise, noise_px = _disagreement(said, disparity)
     alike = np.clip(_ALIKE_NOISE * noise_px / disparity, _ALIKE, _MOST_ALIKE)
-    total, count, denied = own_d.copy(), np.zeros_like(own_d), np.zeros_like(own_d)
+    total, (count, denied, hidden) = own_d.copy(), np.zeros((3, *own_d.shape), own_d.dtype)
     for one in said:
         confirms = np.abs(one.apart) < alike
         total += np.where(confirms, one.d, np.float32(0))
         count += confirms
         denied += one.apart < -alike
+        hidden += one.apart > alike
     d = np.where((count > denied) & own.known.reshape(-1), total / (count + 1), np.float32(np.nan))
-    sigma = _SIGMA * noise_px * (1 + _DENIED * denied) / np.maximum(count, 1) / disparity
+    doubt = 1 + _DENIED * denied + _HIDDEN * hidden
+    sigma = _SIGMA * noise_px * doubt / np.maximum(count, 1) / disparity
     relative = np.hypot(sigma, _SHARED * noise).astype(np.float32)
     z = 1.0 / _enlarged(d.reshape(shape), size)
     variance = (z * cv2.resize(relative.reshape(shape), size, interpolation=cv2.INTER_NEAREST)) ** 2

@@ -25,6 +25,7 @@ from sf_interfaces.types import DepthMap, Float32, Keyframe
 
 _REACH = 0.3  # image widths over which a plane that bounds a gap is lost
 _CELL = 4  # px; planes are fitted to one pixel a cell
+_SURE, _LEAST = 0.1, 0.25  # relative deviation of what gaps are filled from, where that is this share of what is seen
 _FARTHEST = 1.2  # inverse depth beyond nearly all that is seen, as a factor
 # Variance of the log depth in a gap, in units of what it grows with: fitted to exact and sensor depth.
 _BOUNDS = 0.63  # variance of what bounds it: a walk may have crossed an edge where there is none in depth, or not
@@ -75,7 +76,8 @@ def _filled(image: np.ndarray, seen: DepthMap) -> tuple[Float32, Float32]:
     assert seen.variance is not None
     width = image.shape[1]
     d = np.where(seen.valid, 1.0 / np.where(seen.valid, seen.z, 1.0), 0.0).astype(np.float32)
-    support = supports(image, d, seen.valid)
+    sure = seen.valid & (seen.variance * d * d < _SURE**2)
+    support = supports(image, d, sure if sure.sum() > _LEAST * seen.valid.sum() else seen.valid)
     d = np.where(support, d, np.float32(0))
     relative = np.where(support, seen.variance * d * d, 0.0).astype(np.float32)
     slope = spread(image, _slopes(d, support), support, _REACH * width)[..., :2]
