@@ -12,6 +12,7 @@ installed, gets the photo set with ground-truth cameras.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ from sf_bringup.bench_report import FLIGHT
 from sf_bringup.eval_files import read_trajectory
 from sf_bringup.evaluation import align_trajectories, trajectory_error
 from sf_bringup.flythrough import fly
+from sf_bringup.inputs import readout_of
 from sf_bringup.preflight import static_frames
 from sf_bringup.run_folder import RunFolder
 from sf_bringup.simulate import SimulationSpec
@@ -136,12 +138,12 @@ def _strecha(folder: Path, name: str) -> np.ndarray:
     return T
 
 
-def beside_peers(frames: list[Frame], strides: Sequence[int]) -> dict[str, list[dict[str, Any]]]:
-    """Tracking of the same RGB-D frames by this project and by other programs."""
-    tables = {}
+def beside_peers(frames: list[Frame], readout: float, strides: Sequence[int]) -> dict[str, list[dict[str, Any]]]:
+    """Tracking of the same RGB-D frames by this project, which knows the readout, and by other programs."""
+    tables, ours = {}, partial(OurTracker, readout)
     for stride in strides:
         some = frames[::stride]
-        rows = side_by_side(OurTracker, ODOMETRY, some, lambda make, some=some: measure_tracker(make, some))
+        rows = side_by_side(ours, ODOMETRY, some, lambda make, some=some: measure_tracker(make, some))
         tables[f"7-Scenes beside other programs, {len(some)} frames, every {stride}. one"] = rows
     return tables
 
@@ -212,7 +214,7 @@ def main() -> None:
     if (kitchen := args.out / "real" / KITCHEN / "input.mcap").is_file():
         fly(kitchen.parent, 60, kitchen.with_name(FLIGHT))
         provide_vocabulary(bench, args.out)
-        tables |= beside_peers(load_frames(kitchen), (5, 1) if args.full else (5,))
+        tables |= beside_peers(load_frames(kitchen), readout_of(kitchen), (5, 1) if args.full else (5,))
     if (args.out / "real" / STREET / "run.json").is_file():
         tables["the end of a street, LiDAR odometry beside it"] = street_end(RunFolder.open(args.out / "real" / STREET))
     if (args.data / "trajectories_evo").is_dir():

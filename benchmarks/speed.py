@@ -33,10 +33,14 @@ from sf_interfaces.types import Float64, Frame, Keyframe, Trajectory
 
 
 class OurTracker:
-    """The tracking block behind the peers' protocol: poses as they are known when a frame arrives."""
+    """The tracking block behind the peers' protocol: poses as they are known when a frame arrives.
 
-    def __init__(self) -> None:
-        self._tracker = make_part("tracking", ConfigFile({}))
+    Args:
+        readout_s: of a rolling shutter.
+    """
+
+    def __init__(self, readout_s: float = 0.0) -> None:
+        self._tracker = make_part("tracking", ConfigFile({"tracking": {"readout_s": readout_s}}))
 
     def track(self, frame: Frame) -> Float64 | None:
         return self._tracker.track(replace(frame, T_map_camera=None)).T_map_camera
