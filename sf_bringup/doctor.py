@@ -134,8 +134,9 @@ def checks(seconds: float = 3.0, recording: Path | None = None) -> list[Check]:
     """
     if recording is not None:
         from sf_bringup.doctor_recording import recording_checks
+        from sf_bringup.doctor_shutter import shutter_checks
 
-        return recording_checks(recording)
+        return recording_checks(recording) + shutter_checks(recording)
     tests = [
         _versions,
         _import("sf_interfaces.msg"),

@@ -212,6 +212,17 @@ def untracked(given: BagInput) -> TrackingLost:
     )
 
 
+def joined(given: BagInput, made: Plan, config: ConfigFile) -> Iterator[Frame]:
+    """The frames that the head of a line gets, without the line."""
+    inputs = _inputs(given, made, config)
+    with BagReader(given.bag) as reader:
+        for message in _messages(reader, given):
+            inputs.push(*message)
+            yield from inputs.assembler.ready()
+    inputs.assembler.end()
+    yield from inputs.assembler.ready()
+
+
 def _inputs(given: BagInput, made: Plan, config: ConfigFile) -> SensorInputs:
     """The sensor streams the line joins."""
     roles = given.mapping.roles
