@@ -75,15 +75,20 @@ class _Sideways:
         return T
 
 
-def test_motion_during_the_exposure_blurs_an_edge_into_a_ramp_of_known_length() -> None:
-    spec = SimulationSpec("lounge", width=160, height=40, focal=100.0, image_noise=0.0, fps=10.0, blur=0.08)
+def _pass_an_edge(simulator: Simulator) -> None:
+    """Move to the right at 4 m/s, past an edge between dark and bright that is straight ahead at t = 0, 2 m away."""
     builder = SceneBuilder(0)
     white = builder.textures.add(np.full((8, 8, 3), 255, np.uint8))
-    for left, shade in ((0.0, 0.1), (-4.0, 0.7)):  # an edge straight ahead at t = 0, 2 m away
+    for left, shade in ((0.0, 0.1), (-4.0, 0.7)):
         builder.quad((2.0, left, -2.0), (0, 4, 0), (0, 0, 4), white, tint=(shade,) * 3, gloss=0.0)
+    simulator.renderer, simulator.path = Renderer(builder.build(ambient=1.0)), _Sideways(4.0)  # type: ignore[assignment]
+
+
+def test_motion_during_the_exposure_blurs_an_edge_into_a_ramp_of_known_length() -> None:
+    spec = SimulationSpec("lounge", width=160, height=40, focal=100.0, image_noise=0.0, fps=10.0, blur=0.08)
     simulator, sharp = Simulator(spec), Simulator(replace(spec, blur=0.0))
     for one in (simulator, sharp):
-        one.renderer, one.path = Renderer(builder.build(ambient=1.0)), _Sideways(4.0)  # type: ignore[assignment]
+        _pass_an_edge(one)
     (image, z, T), (still, sharp_z, sharp_T) = simulator.frame(1), sharp.frame(1)
     np.testing.assert_array_equal(z, sharp_z)
     np.testing.assert_array_equal(T, sharp_T)
@@ -98,12 +103,8 @@ def test_motion_during_the_exposure_blurs_an_edge_into_a_ramp_of_known_length() 
 
 def test_a_rolling_shutter_slants_an_edge_by_what_the_camera_moves_while_it_is_read() -> None:
     spec = SimulationSpec("lounge", width=160, height=120, focal=100.0, image_noise=0.0, fps=10.0, readout=0.05)
-    builder = SceneBuilder(0)
-    white = builder.textures.add(np.full((8, 8, 3), 255, np.uint8))
-    for left, shade in ((0.0, 0.1), (-4.0, 0.7)):  # an edge straight ahead at t = 0, 2 m away
-        builder.quad((2.0, left, -2.0), (0, 4, 0), (0, 0, 4), white, tint=(shade,) * 3, gloss=0.0)
     simulator = Simulator(spec)
-    simulator.renderer, simulator.path = Renderer(builder.build(ambient=1.0)), _Sideways(4.0)  # type: ignore[assignment]
+    _pass_an_edge(simulator)
     image, z, T = simulator.frame(0)
     assert T[1, 3] == 0.0 and np.nanmax(np.abs(z - 2.0)) < 1e-4
     edge = (image[:, :, 0] < image[60].mean()).sum(axis=1)  # px of the dark side
