@@ -31,6 +31,7 @@ from sf_bringup.evaluation.robust_mvd import mvd_error
 from sf_bringup.evaluation.seen_surface import seen_surface_error
 from sf_bringup.lenses import depth_decoder, image_decoder
 from sf_bringup.run_folder import RunFolder
+from sf_bringup.shutters import Unroller
 from sf_interfaces import topics
 from sf_interfaces.errors import FormatError
 from sf_interfaces.geometry import se3
@@ -274,11 +275,8 @@ def frame_poses(run: RunFolder) -> Trajectory:
 
 def render_held_out(run: RunFolder) -> list[HeldOutView]:
     """Interpolated views: frames between keyframes, drawn at their estimated or given poses."""
-    topic = run.info()["topics"].get("rgb")
-    pose_of = held_out_poses(run)
-    if not pose_of or topic is None:
-        return []
-    return render_at(run, input_bag(run), topic, pose_of)
+    topic, pose_of = run.info()["topics"].get("rgb"), held_out_poses(run)
+    return render_at(run, input_bag(run), topic, pose_of, Unroller(run)) if pose_of and topic is not None else []
 
 
 def render_novel(run: RunFolder, bag: Path | None = None) -> list[HeldOutView]:
@@ -300,7 +298,9 @@ def render_novel(run: RunFolder, bag: Path | None = None) -> list[HeldOutView]:
     return render_at(run, bag, NOVEL_IMAGE, dict(zip(novel.stamps_ns.tolist(), poses, strict=True)))
 
 
-def render_at(run: RunFolder, bag: Path, topic: str, pose_of: Mapping[int, Float64]) -> list[HeldOutView]:
+def render_at(
+    run: RunFolder, bag: Path, topic: str, pose_of: Mapping[int, Float64], unroll: Unroller | None = None
+) -> list[HeldOutView]:
     """Views drawn at T_map_camera by stamp, beside the images of ``topic`` of a bag with these stamps."""
     from sf_bringup.pipeline import load_map
 
@@ -309,6 +309,7 @@ def render_at(run: RunFolder, bag: Path, topic: str, pose_of: Mapping[int, Float
     field, camera, out = load_map(run.map), run.camera(), []
     for stamp, image in decoded(bag, topic, image_decoder(run, bag), set(pose_of)):
         view = field.render(camera, pose_of[stamp])
+        image = image if unroll is None else unroll(stamp, image, view.depth)
         real = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=2)
         out.append(HeldOutView(stamp, view.image, real, view.depth.valid))
     return out
@@ -329,10 +330,8 @@ def render_scores(views: list[HeldOutView]) -> dict[str, Any]:
 
 def image_scores(pairs: list[tuple[UInt8, UInt8]]) -> dict[str, Any]:
     """Medians of PSNR, SSIM and LPIPS (in words why not, where its weights are missing)."""
-    scores: dict[str, Any] = {
-        "psnr_full": float(np.median([psnr(a, b) for a, b in pairs])),
-        "ssim": float(np.median([ssim(a, b) for a, b in pairs])),
-    }
+    parts = (("psnr_full", psnr), ("ssim", ssim))
+    scores: dict[str, Any] = {name: float(np.median([score(a, b) for a, b in pairs])) for name, score in parts}
     try:
         lpips = Lpips.find()
         scores["lpips_alex"] = float(np.median([lpips(a, b) for a, b in pairs]))
