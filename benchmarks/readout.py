@@ -20,11 +20,10 @@ import numpy as np
 from common import Benchmark, load_frames, print_rows
 
 from sf_bringup.evaluation import trajectory_error
-from sf_bringup.inputs import convert
+from sf_bringup.inputs import resolve
 from sf_bringup.simulate import SimulationSpec, Simulator
 from sf_bringup.simulate.trajectories import CameraPath
 from sf_interfaces.geometry import se3
-from sf_interfaces.io.bag import is_bag
 from sf_interfaces.io.datasets import ReadOptions
 from sf_interfaces.types import DepthMap, Float64, Frame, Trajectory
 from sf_tracking.config import TrackingConfig
@@ -91,13 +90,12 @@ def main() -> None:
     bench.parser.add_argument("--parts", nargs="+", help="frames, first:last")
     bench.parser.add_argument("--values", nargs="+", type=float, default=list(VALUES), help="s, three or more")
     args = bench.parse()
-    bag = args.recording
-    if bag is not None and not is_bag(bag):
-        bag = args.out / "readout.mcap"
-        convert(args.recording, bag, ReadOptions())
-    frames = shaken() if bag is None else load_frames(bag)
+    if args.recording is None:
+        frames, parts = shaken(), [f"0:{FRAMES}"]
+    else:
+        frames, parts = load_frames(resolve((args.recording,), args.out, ReadOptions()).bag), ["0:100", "100:200"]
     rows = []
-    for part in args.parts or ([f"0:{FRAMES}"] if bag is None else ["0:100", "100:200"]):
+    for part in args.parts or parts:
         for measured in (True, False):
             rows.append(row(frames, part, measured, args.values))
             print_rows(rows[-1:])

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 from common import Benchmark, load_frames, print_rows
 
-from sf_bringup.inputs import convert, readout_of
+from sf_bringup.inputs import readout_of, resolve
 from sf_depth.config import DepthConfig
 from sf_depth.core.filling import Filler
 from sf_depth.core.sequence import SequenceDepth, SlamSetting
-from sf_interfaces.io.bag import is_bag
 from sf_interfaces.io.datasets import ReadOptions
 from sf_interfaces.types import DepthMap, Float64, Frame, Keyframe
 from sf_tracking.config import TrackingConfig
@@ -71,7 +70,7 @@ def errors(true: DepthMap, depth: DepthMap, scale: float, where: np.ndarray) -> 
 
 def measure(frames: Sequence[Frame], readout: float) -> dict[str, Any]:
     """One row."""
-    kept, filled, whole, scales = [], [], [], []
+    kept, filled, scales = [], [], []
     found = dense_keyframes(frames, readout)
     for true, seen, full in found:
         known = true.valid & seen.valid
@@ -97,10 +96,7 @@ def main() -> None:
     bench.parser.add_argument("recording", type=Path)
     bench.parser.add_argument("--readouts", nargs="+", type=float, help="s; without: as the bag says, and none")
     args = bench.parse()
-    bag = args.recording
-    if not is_bag(bag):
-        bag = args.out / "sequence_depth.mcap"
-        convert(args.recording, bag, ReadOptions())
+    bag = resolve((args.recording,), args.out, ReadOptions()).bag
     frames = load_frames(bag)
     rows = []
     for readout in args.readouts or sorted({0.0, readout_of(bag)}):

@@ -44,10 +44,7 @@ def shutter_checks(recording: Path) -> list[Check]:
     if not is_bag(recording) and datasets.recognise(recording).goal != "auto":
         return []
     with TemporaryDirectory() as scratch:
-        bag = recording
-        if not is_bag(recording):
-            bag = Path(scratch) / "first.mcap"
-            inputs.convert(recording, bag, ReadOptions(limit=2 * PART))
+        bag = inputs.resolve((recording,), Path(scratch), ReadOptions(limit=2 * PART)).bag
         given = preflight.inspect(bag, {})
         if not {"rgb", "camera_info"} <= given.mapping.roles.keys():
             return []

@@ -17,7 +17,7 @@ import yaml
 
 from sf_bringup import inputs, preflight
 from sf_bringup.calibration import calibrated
-from sf_bringup.planner import Plan, plan
+from sf_bringup.planner import INPUT, Plan, plan
 from sf_bringup.preflight import BagInput
 from sf_bringup.run_folder import RunFolder, unpack
 from sf_bringup.summary import Summary, summarise, write_page
@@ -145,7 +145,7 @@ def run(request: RunRequest) -> Summary:
         print(f"sf: {note}", file=sys.stderr)
     made = _planned(request, given, source)
     made.check_runnable()
-    if any(step.sources.get(q) == "input" for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
+    if any(step.sources.get(q) == INPUT for step in made.steps for q in step.sources if q.name == "SPARSE_DEPTH"):
         preflight.check_extrinsic(given)
     config = with_shutter(ConfigFile.load(request.config, request.overrides), made, source.bag)
     config.check_sections({spec.name for spec in load_blocks()} | {"sync", "hosts"})
@@ -169,7 +169,7 @@ def with_shutter(config: ConfigFile, made: Plan, bag: Path) -> ConfigFile:
         FormatError: what it says is no number.
     """
     tracking = made.step("tracking")
-    direct = tracking is not None and tracking.sources.get(Quantity.IMAGE) == "input"
+    direct = tracking is not None and tracking.sources.get(Quantity.IMAGE) == INPUT
     readout = inputs.readout_of(bag) if direct else 0.0
     return config.with_default("tracking", "readout_s", readout) if readout else config
 

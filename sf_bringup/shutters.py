@@ -8,7 +8,7 @@ import numpy as np
 from sf_bringup.run_folder import RunFolder
 from sf_interfaces.config import ConfigFile
 from sf_interfaces.geometry import se3
-from sf_interfaces.geometry.rolling_shutter import Readout, nearness, unrolled
+from sf_interfaces.geometry.rolling_shutter import Readout, nearness, unrolled, velocity_between
 from sf_interfaces.types import DepthMap, Float64, Frame, UInt8
 
 _THINNED = 7  # every n-th pixel of a view tells how near the scene is
@@ -23,9 +23,7 @@ class Unroller:
         self._readout = Readout(float(values.get("readout_s", 0.0)))
         self._camera = run.camera()
         if self._readout:
-            trajectory = run.trajectory()
-            order = np.argsort(trajectory.stamps_ns)
-            self._stamps, self._poses = trajectory.stamps_ns[order], trajectory.poses[order]
+            self._trajectory = run.trajectory()
 
     def __call__(self, stamp_ns: int, image: UInt8, depth: DepthMap) -> UInt8:
         """The image [H, W] or [H, W, 3] of a tracked frame; ``depth`` [H, W] is what is seen there."""
@@ -40,9 +38,10 @@ class Unroller:
 
     def _velocity(self, stamp_ns: int) -> Float64:
         """[6] of points in the camera's frame, between the frames before and after; zero where there are none."""
-        at = int(np.searchsorted(self._stamps, stamp_ns))
-        first, last = max(at - 1, 0), min(at + 1, len(self._stamps) - 1)
+        stamps, poses = self._trajectory.stamps_ns, self._trajectory.poses
+        at = int(np.searchsorted(stamps, stamp_ns))
+        first, last = max(at - 1, 0), min(at + 1, len(stamps) - 1)
         if last <= first:
             return np.zeros(6)
-        motion = se3.inverse(self._poses[last]) @ self._poses[first]
-        return np.asarray(se3.log(motion) / (1e-9 * float(self._stamps[last] - self._stamps[first])))
+        before, after = ((int(stamps[k]), se3.inverse(poses[k])) for k in (first, last))
+        return velocity_between(before, after)

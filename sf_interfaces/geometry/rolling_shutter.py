@@ -13,6 +13,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sf_interfaces.geometry import se3
 from sf_interfaces.types import Camera, DepthMap, Float32, Float64, Frame
 
 _CELL = 5  # px between the points at which the shift is computed; odd, so that enlarging meets them
@@ -33,6 +34,11 @@ class Readout:
 
     def __bool__(self) -> bool:
         return self.image != 0.0
+
+
+def velocity_between(first: tuple[int, Float64], second: tuple[int, Float64]) -> Float64:
+    """[6] of points in the camera's frame, per s, between two stamps (ns) with T_cw [4, 4]."""
+    return np.asarray(se3.log(second[1] @ se3.inverse(first[1])) / (1e-9 * (second[0] - first[0])))
 
 
 def nearness(camera: Camera, uv: Float64, w: Float64) -> Float32:

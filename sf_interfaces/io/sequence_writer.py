@@ -18,8 +18,6 @@ from sf_interfaces.types import Camera, DepthMap, Float64, PointCloud, Scale, Tr
 
 _IMAGE, _INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 _STATE = "sf_interfaces/msg/KeyframeState"
-
-
 SHUTTER = "shutter"  # metadata of a bag: no message of ROS says how a camera reads its rows
 
 

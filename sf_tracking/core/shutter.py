@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from sf_interfaces.geometry import se3
-from sf_interfaces.geometry.rolling_shutter import Readout, shift, unrolled, unrolled_by_flow
+from sf_interfaces.geometry.rolling_shutter import Readout, shift, unrolled, unrolled_by_flow, velocity_between
 from sf_interfaces.types import Float32, Float64, Frame, UInt8
 from sf_tracking.config import TrackingConfig
 from sf_tracking.core.patches import to_gray
@@ -27,7 +26,6 @@ class Shutter:
     def __init__(self, config: TrackingConfig) -> None:
         self._readout = Readout(config.readout_s, config.depth_readout_s)
         self._last: tuple[int, UInt8] | None = None  # stamp and image of the last frame before the map
-        self._velocity = np.zeros(6)  # that the last frame was undone with
 
     def __bool__(self) -> bool:
         return bool(self._readout)
@@ -48,31 +46,25 @@ class Shutter:
             recent: their stamps and T_cw; fewer where the camera was lost.
             near: inverse depth of what is seen, in the unit of the poses.
         """
-        if not self._readout:
-            return frame
-        self._last = None
-        self._velocity = _velocity(*recent[-2:]) if len(recent) > 1 else np.zeros(6)
-        return unrolled(frame, self._velocity, near, self._readout)
+        return unrolled(frame, _so_far(recent), near, self._readout)
 
     def corrected(
         self, frame: Frame, recent: Sequence[tuple[int, Float64]], T_cw: Float64, near: Float32
     ) -> Frame | None:
         """Undone again, where the pose found for the frame shows that the camera moved otherwise; else None."""
-        if not self._readout or not recent or frame.camera is None:
+        if not recent or frame.camera is None:
             return None
-        now = (frame.stamp_ns, T_cw)
-        velocity = _velocity(recent[-1], now)  # half an interval ago
+        used, now = _so_far(recent), velocity_between(recent[-1], (frame.stamp_ns, T_cw))  # now: half an interval ago
         if len(recent) > 1 and frame.stamp_ns - recent[-1][0] < _REGULAR * (recent[-1][0] - recent[-2][0]):
-            velocity += _AHEAD * (velocity - _velocity(*recent[-2:]))
-        if shift(frame.camera, velocity - self._velocity, near, self._readout.image) < _SAME_PX:
+            now += _AHEAD * (now - used)
+        if shift(frame.camera, now - used, near, self._readout.image) < _SAME_PX:
             return None
-        self._velocity = velocity
-        return unrolled(frame, velocity, near, self._readout)
+        return unrolled(frame, now, near, self._readout)
 
 
-def _velocity(first: tuple[int, Float64], second: tuple[int, Float64]) -> Float64:
-    """[6] of points in the camera's frame, between two stamps with T_cw."""
-    return np.asarray(se3.log(second[1] @ se3.inverse(first[1])) / (1e-9 * (second[0] - first[0])))
+def _so_far(recent: Sequence[tuple[int, Float64]]) -> Float64:
+    """Velocity between the last two frames; 0 where they are not known."""
+    return velocity_between(*recent[-2:]) if len(recent) > 1 else np.zeros(6)
 
 
 def image_velocity(stamp_ns: int, first: UInt8, later_ns: int, second: UInt8) -> Float32:

@@ -79,11 +79,9 @@ def test_a_simulated_image_becomes_that_of_a_global_shutter(rolled: tuple[Simula
     velocity = se3.log(se3.inverse(after) @ before) / 0.002
     near = nearness(CAMERA, CAMERA.pixel_grid().reshape(-1, 2), 1 / z.ravel().astype(np.float64))
 
-    def off(seen: np.ndarray) -> float:
+    def off(seen: np.ndarray) -> float:  # smoothed, as no interpolation brings back what is finer than a pixel
         smooth, wanted = (cv2.GaussianBlur(part.astype(np.float32), (0, 0), 1.0) for part in (seen, true))
-        return float(
-            np.abs(smooth - wanted)[8:-8, 8:-8].mean()
-        )  # what is finer than a pixel no interpolation brings back
+        return float(np.abs(smooth - wanted)[8:-8, 8:-8].mean())
 
     found = unrolled(frame_of(image), velocity, near, Readout(0.03)).image
     assert found is not None and off(found) < 0.5 * off(image)
